@@ -1,0 +1,1 @@
+"""NeRFs from a moving event camera and its imperfect trajectory."""

@@ -1,0 +1,43 @@
+"""What goes wrong for a user: one class per room, one line per message, exit code 2."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class EbarfError(Exception):
+    """Base of everything a user can cause and cure; the message names file, place, value and expectation."""
+
+
+class SceneError(EbarfError):
+    """The scene folder or its scene.json is not as the format says."""
+
+
+class RecordingError(EbarfError):
+    """The event recording cannot be read or does not fit the sensor or the trajectory."""
+
+
+class TrajectoryError(EbarfError):
+    """The keyframe poses cannot be read, interpolated or aligned."""
+
+
+class TrainingError(EbarfError):
+    """The training cannot go on."""
+
+
+class EvaluationError(EbarfError):
+    """A run cannot be evaluated."""
+
+
+class SimulationError(EbarfError):
+    """The simulation was asked for something that it cannot make."""
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turn an :class:`EbarfError` into one line on standard error and exit code 2, without a traceback."""
+    try:
+        yield
+    except EbarfError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

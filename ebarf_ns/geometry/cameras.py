@@ -1,0 +1,100 @@
+"""From pixel to bearing: the camera models of the datasets and their inverse."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+CameraModel = Literal["pinhole", "radtan", "equidistant"]
+COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics and distortion; pixel centres are at integer coordinates.
+
+    ``distortion`` is () for ``pinhole``, (k1, k2, p1, p2[, k3]) for ``radtan`` (Brown), (k1, k2, k3, k4) for
+    ``equidistant`` (Kannala-Brandt).
+    """
+
+    model: CameraModel
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def pixel_grid(self) -> Float[Tensor, "height width 2"]:
+        """The coordinates (x, y) of every pixel centre, float64."""
+        y, x = torch.meshgrid(torch.arange(self.height), torch.arange(self.width), indexing="ij")
+        return torch.stack([x, y], dim=-1).double()
+
+    def bearings(self, pixel: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+        """Unit viewing directions of pixels, in the camera's OpenCV frame, float64."""
+        pixel = pixel.double()
+        centre = torch.tensor([self.cx, self.cy], dtype=torch.float64)
+        focal = torch.tensor([self.fx, self.fy], dtype=torch.float64)
+        distorted = (pixel - centre) / focal
+        if self.model == "equidistant":
+            return _equidistant_bearings(distorted, self.distortion)
+        plane = _undistort_radtan(distorted, self.distortion) if self.model == "radtan" else distorted
+        ray = torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
+        return ray / ray.norm(dim=-1, keepdim=True)
+
+    def project(self, point: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
+        """Pixel coordinates of points in the camera frame (z > 0), float64."""
+        plane = point.double()[..., :2] / point.double()[..., 2:]
+        if self.model == "radtan":
+            plane = _distort_radtan(plane, self.distortion)
+        if self.model == "equidistant":
+            radius = plane.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+            plane = plane / radius * _equidistant_radius(radius.atan(), self.distortion)
+        return plane * torch.tensor([self.fx, self.fy]).double() + torch.tensor([self.cx, self.cy]).double()
+
+
+def _distort_radtan(plane: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+    k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
+    x, y = plane.unbind(-1)
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return torch.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        ],
+        dim=-1,
+    )
+
+
+def _undistort_radtan(distorted: Tensor, coefficients: tuple[float, ...], iterations: int = 20) -> Tensor:
+    """Newton's method on the distortion; its Jacobian is 2x2 and comes from autograd's vector products."""
+    plane = distorted.clone()
+    for _ in range(iterations):
+        with torch.enable_grad():
+            point = plane.detach().requires_grad_()
+            image = _distort_radtan(point, coefficients)
+            rows = [torch.autograd.grad(image[..., i].sum(), point, retain_graph=True)[0] for i in range(2)]
+        plane = plane - torch.linalg.solve(torch.stack(rows, dim=-2), image.detach() - distorted)
+    return plane
+
+
+def _equidistant_radius(angle_rad: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+    k1, k2, k3, k4 = coefficients
+    a2 = angle_rad * angle_rad
+    return angle_rad * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+
+
+def _equidistant_bearings(distorted: Tensor, coefficients: tuple[float, ...], iterations: int = 20) -> Tensor:
+    radius = distorted.norm(dim=-1, keepdim=True)
+    angle_rad = radius.clone()
+    k1, k2, k3, k4 = coefficients
+    for _ in range(iterations):
+        a2 = angle_rad * angle_rad
+        slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
+        angle_rad = angle_rad - (_equidistant_radius(angle_rad, coefficients) - radius) / slope
+    direction = distorted / radius.clamp_min(1e-12)
+    return torch.cat([direction * angle_rad.sin(), angle_rad.cos()], dim=-1)

@@ -1,0 +1,129 @@
+"""Timestamped keyframe poses, their corrections, and the pose of any moment between them.
+
+Poses are camera-to-world, OpenCV axes (x right, y down, z forward). Times are int64 microseconds up to the one
+subtraction that makes them a fraction of a keyframe interval.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.geometry.so3 import quat_wxyz_exp, quat_wxyz_multiply, quat_wxyz_to_matrix, rotate, slerp_wxyz
+
+Interpolation = Literal["linear", "cubic"]
+
+
+class Poses(NamedTuple):
+    """Camera-to-world poses."""
+
+    position: Float[Tensor, "*batch 3"]
+    quat_wxyz: Float[Tensor, "*batch 4"]
+
+    def matrix(self) -> Float[Tensor, "*batch 3 4"]:
+        """[R | t]."""
+        return torch.cat([quat_wxyz_to_matrix(self.quat_wxyz), self.position[..., None]], dim=-1)
+
+    def compose(self, local: "Poses") -> "Poses":
+        """``self · local``: apply ``local`` in the frame of these poses."""
+        return Poses(
+            self.position + rotate(self.quat_wxyz, local.position),
+            quat_wxyz_multiply(self.quat_wxyz, local.quat_wxyz),
+        )
+
+
+class Trajectory(NamedTuple):
+    """Keyframe poses with strictly increasing times."""
+
+    t_us: Int64[Tensor, "keyframes"]
+    poses: Poses
+
+    def double(self) -> "Trajectory":
+        """The same in float64."""
+        return Trajectory(self.t_us, Poses(self.poses.position.double(), self.poses.quat_wxyz.double()))
+
+
+def check_keyframes(t_us: Int64[Tensor, "keyframes"]) -> None:
+    """Raise :class:`TrajectoryError` unless there are two keyframes or more, in strictly increasing time."""
+    if len(t_us) < 2:
+        raise TrajectoryError(f"a trajectory needs at least 2 keyframes, got {len(t_us)}")
+    late = torch.nonzero(t_us[1:] <= t_us[:-1])
+    if len(late):
+        k = int(late[0])
+        raise TrajectoryError(
+            f"keyframe {k + 1} is at {int(t_us[k + 1])} us, not after keyframe {k} at {int(t_us[k])} us"
+        )
+
+
+def corrected(keyframes: Poses, correction: Float[Tensor, "keyframes 6"]) -> Poses:
+    """T · (exp(ω), υ): each keyframe moved in its own camera frame by ``correction = (ω [rad], υ [units])``."""
+    return keyframes.compose(Poses(correction[..., 3:], quat_wxyz_exp(correction[..., :3])))
+
+
+def within_span(t_us: Int64[Tensor, "*batch"], keyframe_t_us: Int64[Tensor, "keyframes"]) -> Bool[Tensor, "*batch"]:
+    """Whether each time lies between the first and the last keyframe, both included."""
+    return (t_us >= keyframe_t_us[0]) & (t_us <= keyframe_t_us[-1])
+
+
+def interpolate(
+    keyframe_t_us: Int64[Tensor, "keyframes"],
+    keyframes: Poses,
+    t_us: Int64[Tensor, "*batch"],
+    translation: Interpolation = "linear",
+) -> Poses:
+    """The poses at ``t_us``: SLERP of the rotations, and LERP (Eq. 3) or a natural cubic spline of the positions.
+
+    Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
+    """
+    t_us = t_us.clamp(keyframe_t_us[0], keyframe_t_us[-1])
+    left = (torch.searchsorted(keyframe_t_us, t_us, right=True) - 1).clamp(0, len(keyframe_t_us) - 2)
+    interval_us = keyframe_t_us[left + 1] - keyframe_t_us[left]
+    dtype = keyframes.position.dtype
+    fraction = ((t_us - keyframe_t_us[left]).double() / interval_us.double()).to(dtype)
+    a, b = keyframes.position[left], keyframes.position[left + 1]
+    position = a + fraction[..., None] * (b - a)
+    if translation == "cubic":
+        curvature = _natural_spline_curvature(keyframe_t_us, keyframes.position)
+        interval_s = (interval_us.double() * 1e-6).to(dtype)[..., None]
+        u = fraction[..., None]
+        position = position + interval_s**2 / 6 * (
+            ((1 - u) ** 3 - (1 - u)) * curvature[left] + (u**3 - u) * curvature[left + 1]
+        )
+    return Poses(position, slerp_wxyz(keyframes.quat_wxyz[left], keyframes.quat_wxyz[left + 1], fraction))
+
+
+def _natural_spline_curvature(
+    keyframe_t_us: Int64[Tensor, "keyframes"], position: Float[Tensor, "keyframes 3"]
+) -> Float[Tensor, "keyframes 3"]:
+    """Second derivatives of the natural cubic spline at its knots, per second squared (zero at both ends)."""
+    count = len(keyframe_t_us)
+    if count == 2:
+        return torch.zeros_like(position)
+    interval_s = (keyframe_t_us[1:] - keyframe_t_us[:-1]).double() * 1e-6
+    slope = (position[1:] - position[:-1]).double() / interval_s[:, None]
+    curvature: Tensor = _SolveTridiagonal.apply(interval_s, 6 * (slope[1:] - slope[:-1]))  # pyright: ignore[reportAssignmentType]
+    return torch.nn.functional.pad(curvature, (0, 0, 1, 1)).to(position.dtype)
+
+
+class _SolveTridiagonal(torch.autograd.Function):
+    """x of A x = b for the symmetric tridiagonal A of the spline; linear in the number of keyframes."""
+
+    @staticmethod
+    def forward(ctx, interval_s: Tensor, right: Tensor) -> Tensor:
+        ctx.interval_s = interval_s
+        return _solve_spline_system(interval_s, right)
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor) -> tuple[None, Tensor]:
+        return None, _solve_spline_system(ctx.interval_s, gradients[0])
+
+
+def _solve_spline_system(interval_s: Tensor, right: Tensor) -> Tensor:
+    upper_bands = torch.zeros(2, len(interval_s) - 1, dtype=torch.float64)
+    upper_bands[0, 1:] = interval_s[1:-1]
+    upper_bands[1] = 2 * (interval_s[1:] + interval_s[:-1])
+    solution = solveh_banded(upper_bands.numpy(), right.detach().cpu().numpy())
+    return torch.from_numpy(solution).to(right)

@@ -1,0 +1,257 @@
+"""The scene folder: scene.json and the files it names, read, validated and written."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ebarf_ns.errors import SceneError
+from ebarf_ns.files import whole_file
+from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
+
+FORMAT, VERSION = "ebarf-scene", 1
+FrameIntensity = Literal["linear", "srgb", "log"]
+
+
+@dataclass(frozen=True)
+class ContrastThreshold:
+    """The change of log brightness that an event reports, per polarity."""
+
+    on: float
+    off: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A validation frame: never used for training."""
+
+    path: Path
+    t_us: int
+    camera: Camera
+    event_camera_from_frame_camera: tuple[tuple[float, ...], ...]
+    """4x4; identity where the event sensor itself took the frame."""
+    intensity: FrameIntensity
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a scene folder holds; paths are absolute or relative to the working directory, never to the folder."""
+
+    folder: Path
+    events: Path
+    trajectory: Path
+    camera: Camera
+    groundtruth: Path | None = None
+    frames: tuple[Frame, ...] = ()
+    contrast_threshold: ContrastThreshold | None = None
+    bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Lower and upper corner in world units."""
+
+
+def read_scene(folder: Path) -> Scene:
+    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation."""
+    path = folder / "scene.json"
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder, expected a scene folder with scene.json in it")
+    content = _Object(path, "", _read_json(path))
+    content.only("format version events trajectory groundtruth frames camera contrast_threshold bounds".split())
+    for key, expected in (("format", FORMAT), ("version", VERSION)):
+        if content.get(key) != expected:
+            raise SceneError(f"{path}: {key} is {content.get(key)!r}, expected {expected!r}")
+    camera = _camera(content.object("camera"))
+    frames = content.optional_file("frames")
+    return Scene(
+        folder=folder,
+        events=content.file("events"),
+        trajectory=content.file("trajectory"),
+        camera=camera,
+        groundtruth=content.optional_file("groundtruth"),
+        frames=_read_frames(frames, camera) if frames else (),
+        contrast_threshold=_threshold(content.object("contrast_threshold"))
+        if content.get("contrast_threshold") is not None
+        else None,
+        bounds=_bounds(content) if content.get("bounds") is not None else None,
+    )
+
+
+def write_scene(scene: Scene) -> None:
+    """Write ``scene.json`` and, with frames, ``frames.json``; the files that they name are the caller's to write."""
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "events": _relative(scene.events, scene.folder),
+        "trajectory": _relative(scene.trajectory, scene.folder),
+        "groundtruth": _relative(scene.groundtruth, scene.folder) if scene.groundtruth else None,
+        "frames": "frames.json" if scene.frames else None,
+        "camera": _camera_json(scene.camera),
+        "contrast_threshold": vars(scene.contrast_threshold) if scene.contrast_threshold else None,
+        "bounds": scene.bounds,
+    }
+    if scene.frames:
+        _write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
+    _write_json(scene.folder / "scene.json", content)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix()
+
+
+def _camera_json(camera: Camera) -> dict[str, Any]:
+    return {**vars(camera), "distortion": list(camera.distortion)}
+
+
+def _frame_json(frame: Frame, scene: Scene) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "file": _relative(frame.path, scene.folder),
+        "t_us": frame.t_us,
+        "intensity": frame.intensity,
+    }
+    if frame.camera != scene.camera:
+        content["camera"] = _camera_json(frame.camera)
+    if not np.array_equal(frame.event_camera_from_frame_camera, np.eye(4)):
+        content["event_camera_from_frame_camera"] = frame.event_camera_from_frame_camera
+    return content
+
+
+def _write_json(path: Path, content: object) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: byte {error.start} is not UTF-8 text") from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise SceneError(f"{path}: not valid JSON ({error})") from None
+
+
+class _Object:
+    """A JSON object that knows where it stands, so that every complaint names file and key."""
+
+    def __init__(self, path: Path, place: str, content: object):
+        if not isinstance(content, Mapping):
+            raise SceneError(f"{path}: {place or 'the file'} is {content!r:.40}, expected a JSON object")
+        self.path, self.place, self.content = path, place, content
+
+    def name(self, key: str) -> str:
+        return f"{self.place}.{key}" if self.place else key
+
+    def get(self, key: str) -> Any:
+        return self.content.get(key)
+
+    def only(self, keys: list[str]) -> None:
+        unknown = [key for key in self.content if key not in keys]
+        if unknown:
+            names = ", ".join(self.name(key) for key in unknown)
+            raise SceneError(f"{self.path}: unknown key {names}, expected among: {', '.join(keys)}")
+
+    def wrong(self, key: str, expected: str) -> SceneError:
+        found = repr(self.content[key]) if key in self.content else "missing"
+        return SceneError(f"{self.path}: {self.name(key)} is {found:.80}, expected {expected}")
+
+    def object(self, key: str) -> "_Object":
+        if not isinstance(self.get(key), Mapping):
+            raise self.wrong(key, "a JSON object")
+        return _Object(self.path, self.name(key), self.get(key))
+
+    def file(self, key: str) -> Path:
+        name = self.get(key)
+        if not isinstance(name, str) or not name:
+            raise self.wrong(key, "a file name")
+        path = self.path.parent / name
+        if not path.is_file():
+            raise SceneError(f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}")
+        return path
+
+    def optional_file(self, key: str) -> Path | None:
+        return self.file(key) if self.get(key) is not None else None
+
+    def number(self, key: str, expected: str = "a finite number", positive: bool = False) -> float:
+        value = self.get(key)
+        if not _is_number(value) or (positive and value <= 0):
+            raise self.wrong(key, f"{expected} above 0" if positive else expected)
+        return float(value)
+
+    def integer(self, key: str, positive: bool = False) -> int:
+        value = self.get(key)
+        if not isinstance(value, int) or isinstance(value, bool) or (positive and value <= 0):
+            raise self.wrong(key, "an integer above 0" if positive else "an integer")
+        return value
+
+    def choice(self, key: str, choices: tuple[str, ...]) -> Any:
+        if self.get(key) not in choices:
+            raise self.wrong(key, f"one of {', '.join(choices)}")
+        return self.get(key)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _camera(content: _Object) -> Camera:
+    content.only("model width height fx fy cx cy distortion".split())
+    model = content.choice("model", tuple(COEFFICIENTS))
+    distortion = content.get("distortion") or []
+    counts = COEFFICIENTS[model]
+    if not isinstance(distortion, list) or len(distortion) not in counts or not all(map(_is_number, distortion)):
+        raise content.wrong("distortion", f"a list of {' or '.join(map(str, counts))} numbers for model {model}")
+    return Camera(
+        model=model,
+        width=content.integer("width", positive=True),
+        height=content.integer("height", positive=True),
+        fx=content.number("fx", positive=True),
+        fy=content.number("fy", positive=True),
+        cx=content.number("cx"),
+        cy=content.number("cy"),
+        distortion=tuple(float(value) for value in distortion),
+    )
+
+
+def _threshold(content: _Object) -> ContrastThreshold:
+    content.only(["on", "off"])
+    return ContrastThreshold(content.number("on", positive=True), content.number("off", positive=True))
+
+
+def _bounds(content: _Object) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    bounds = content.get("bounds")
+    expected = "two corners [[x, y, z], [x, y, z]], the first below the second on every axis"
+    if not isinstance(bounds, list) or len(bounds) != 2:
+        raise content.wrong("bounds", expected)
+    lower, upper = bounds
+    for corner in bounds:
+        if not isinstance(corner, list) or len(corner) != 3 or not all(map(_is_number, corner)):
+            raise content.wrong("bounds", expected)
+    if not all(low < high for low, high in zip(lower, upper, strict=True)):
+        raise content.wrong("bounds", expected)
+    return tuple(map(float, lower)), tuple(map(float, upper))
+
+
+def _read_frames(path: Path, event_camera: Camera) -> tuple[Frame, ...]:
+    content = _read_json(path)
+    if not isinstance(content, list):
+        raise SceneError(f"{path}: holds a {type(content).__name__}, expected a list of frames")
+    return tuple(_frame(_Object(path, f"[{k}]", item), event_camera) for k, item in enumerate(content))
+
+
+def _frame(content: _Object, event_camera: Camera) -> Frame:
+    content.only("file t_us camera event_camera_from_frame_camera intensity".split())
+    extrinsic = content.get("event_camera_from_frame_camera")
+    if extrinsic is not None:
+        rows = isinstance(extrinsic, list) and len(extrinsic) == 4 and all(isinstance(row, list) for row in extrinsic)
+        if not rows or not all(len(row) == 4 and all(map(_is_number, row)) for row in extrinsic):
+            raise content.wrong("event_camera_from_frame_camera", "a 4x4 matrix of numbers")
+    return Frame(
+        path=content.file("file"),
+        t_us=content.integer("t_us"),
+        camera=_camera(content.object("camera")) if content.get("camera") is not None else event_camera,
+        event_camera_from_frame_camera=tuple(map(tuple, extrinsic or np.eye(4).tolist())),
+        intensity=content.choice("intensity", get_args(FrameIntensity)),
+    )
