@@ -1,0 +1,182 @@
+"""Event pairs to camera-frame rays: what nerfstudio calls the data manager."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from ebarf_ns.errors import EbarfError, RecordingError
+from ebarf_ns.events.pairs import (
+    EventPairs,
+    PairIndex,
+    accumulate,
+    batch_random,
+    draw_steps,
+    heldout_blocks,
+    split_pairs,
+)
+from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
+from ebarf_ns.scene import Scene
+
+_HELDOUT_SEED = 1 << 32
+_LONGEST_HELDOUT_PAIR = 30
+
+
+class EventDataset(InputDataset):
+    """Cameras with a picture each: the frame taken there, or else the events around that keyframe."""
+
+    def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0):
+        super().__init__(dataparser_outputs, scale_factor)
+        self.scene: Scene = self.metadata["scene"]
+        self.recording: Recording | None = None
+
+    def get_numpy_image(self, image_idx: int) -> np.ndarray:
+        """8-bit grey in three channels, for people to look at; evaluation reads the frames themselves."""
+        path = self._dataparser_outputs.image_filenames[image_idx]
+        grey = self._read_frame(path) if path.is_file() else self._events_around(image_idx)
+        size = (int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx]))
+        return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)[:, :, None].repeat(3, axis=2)
+
+    def _read_frame(self, path: Any) -> np.ndarray:
+        from ebarf_ns.evaluation.frames import read_frame
+
+        frame = next(frame for frame in self.scene.frames if frame.path == path)
+        linear = read_frame(frame)
+        return (np.clip(linear / max(linear.max(), 1e-9), 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
+
+    def _events_around(self, image_idx: int) -> np.ndarray:
+        camera = self.scene.camera
+        if self.recording is None:
+            try:
+                self.recording = read_recording(self.scene.events, camera.width, camera.height)
+            except EbarfError:
+                # A trained run can be looked at when its recording is gone.
+                return np.full((camera.height, camera.width), 128, np.uint8)
+        assert self.cameras.metadata is not None
+        times = self.cameras.metadata["camera_t_us"][:, 0]
+        half_us = int(times.diff().median()) // 2 if len(times) > 1 else 10_000
+        t_us = int(times[image_idx])
+        return accumulate(self.recording.between(t_us - half_us, t_us + half_us), camera.width, camera.height)
+
+
+@dataclass
+class EventDataManagerConfig(VanillaDataManagerConfig):
+    """Event pairs from a scene folder."""
+
+    _target: type = field(default_factory=lambda: EventDataManager)
+    dataparser: DataParserConfig = field(default_factory=EbarfDataParserConfig)
+    train_num_rays_per_batch: int = 1024
+    """Rays per step: two for each event pair."""
+    eval_num_rays_per_batch: int = 8192
+    """Rays of the held-out pairs: two for each."""
+    longest_pair: int = 30
+    """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
+    heldout_share: float = 0.05
+    """Share of the recording's time whose events are kept for heldout_event_loss."""
+    seed: int = 0
+    """Batch number k of a seed is always the same batch."""
+
+
+class EventDataManager(VanillaDataManager[EventDataset]):
+    """Hands out rays in the camera's own frame, with their times; poses live in the model."""
+
+    config: EventDataManagerConfig
+    train_dataset: EventDataset
+    eval_dataset: EventDataset
+
+    def setup_train(self) -> None:
+        """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
+        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
+        if self.test_mode == "val":
+            recording = self.recording
+            CONSOLE.print(f"{len(recording):,} events, {self.pairs[0].pairs_by_steps[1]:,} consecutive pairs to train on")
+
+    def setup_eval(self) -> None:
+        """The loaders of full views that nerfstudio's scripts ask for."""
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
+        self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
+
+    @cached_property
+    def recording(self) -> Recording:
+        """The events within the trajectory's span; those outside are counted and left out."""
+        scene: Scene = self.train_dataset.scene
+        keyframes: Trajectory = self.train_dataset.metadata["keyframes"]
+        start_us, end_us = int(keyframes.t_us[0]), int(keyframes.t_us[-1])
+        whole = read_recording(scene.events, scene.camera.width, scene.camera.height)
+        recording = whole.between(start_us, end_us)
+        if not len(recording):
+            raise RecordingError(
+                f"{scene.events}: none of the {len(whole):,} events, {whole.t_us[0]} to {whole.t_us[-1]} us, lies "
+                f"within the span of {scene.trajectory.name}, {start_us} to {end_us} us; expected the same clock and, "
+                "in the trajectory, seconds"
+            )
+        if len(recording) < len(whole):
+            CONSOLE.print(
+                f"left out {len(whole) - len(recording):,} of {len(whole):,} events, outside the trajectory's span"
+            )
+        return recording
+
+    @cached_property
+    def pairs(self) -> tuple[PairIndex, PairIndex]:
+        """Pairs for training and pairs held out."""
+        camera = self.train_dataset.scene.camera
+        heldout = heldout_blocks(self.recording.t_us, self.config.heldout_share)
+        return split_pairs(self.recording, camera.width, camera.height, heldout)
+
+    @cached_property
+    def bearings(self) -> torch.Tensor:
+        """Unit viewing direction of every pixel, float32."""
+        camera = self.train_dataset.scene.camera
+        return camera.bearings(camera.pixel_grid()).float().flatten(0, 1).to(self.device)
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
+        """Rays of batch number ``step``; scripts that keep asking for step 0 get one batch after another."""
+        self.train_count += 1
+        batch = step if self.test_mode == "val" else self.train_count
+        random = batch_random(self.config.seed, batch * self.world_size + self.local_rank)
+        count = self.get_train_rays_per_batch() // 2
+        steps = draw_steps(count, self.config.longest_pair, random)
+        return self._rays(self.pairs[0].sample(steps, random))
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
+        """Rays of the held-out pairs, the same for every step, method and seed."""
+        self.eval_count += 1
+        heldout = self.pairs[1]
+        if not heldout.max_steps:
+            raise RecordingError(
+                f"{self.train_dataset.scene.events}: no pair of events ends in the held-out {self.config.heldout_share:.0%} "
+                "of the recording; expected a larger heldout-share or a longer recording"
+            )
+        random = batch_random(_HELDOUT_SEED, 0)
+        steps = draw_steps(self.config.eval_num_rays_per_batch // 2, _LONGEST_HELDOUT_PAIR, random)
+        return self._rays(heldout.sample(steps, random))
+
+    def get_train_rays_per_batch(self) -> int:
+        """What ns-export overwrites by --num-rays-per-batch."""
+        assert self.train_pixel_sampler is not None
+        return self.train_pixel_sampler.num_rays_per_batch
+
+    def _rays(self, pairs: EventPairs) -> tuple[RayBundle, dict[str, torch.Tensor]]:
+        def tensor(column: np.ndarray) -> torch.Tensor:
+            return torch.from_numpy(column).to(self.device)
+
+        directions = self.bearings[tensor(pairs.pixel)].repeat(2, 1)
+        bundle = RayBundle(
+            origins=torch.zeros_like(directions),
+            directions=directions,
+            pixel_area=torch.ones_like(directions[:, :1]),
+            camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
+            metadata={"event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None]},
+        )
+        return bundle, {"polarity_sum": tensor(pairs.polarity_sum), "event_count": tensor(pairs.event_count)}

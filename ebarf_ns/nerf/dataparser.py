@@ -1,0 +1,174 @@
+"""Scene folder to nerfstudio cameras: one camera a keyframe for training, one a frame for evaluation.
+
+Kept light: nerfstudio imports this module while its own are half loaded.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
+
+from ebarf_ns.errors import SceneError, one_line_errors
+from ebarf_ns.geometry.cameras import Camera
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.scene import Scene, read_scene
+
+# Without bounds, the trajectory fills this share of the part of space that is not contracted.
+_TRAJECTORY_SHARE = 0.25
+_STAND_IN_VIEWS = 8
+
+
+class Normalization(NamedTuple):
+    """World to training coordinates: (point - centre) * scale, so that the scene fills [-1, 1]³."""
+
+    centre: Float[Tensor, "3"]
+    scale: float
+
+    def apply(self, trajectory: Trajectory) -> Trajectory:
+        """World poses to training coordinates, float32."""
+        position, quat_wxyz = trajectory.poses
+        moved = (position.double() - self.centre) * self.scale
+        return Trajectory(trajectory.t_us, Poses(moved.float(), quat_wxyz.float()))
+
+    def invert(self, trajectory: Trajectory) -> Trajectory:
+        """Training coordinates to world poses, float64."""
+        position, quat_wxyz = trajectory.poses
+        return Trajectory(
+            trajectory.t_us, Poses(position.double().cpu() / self.scale + self.centre, quat_wxyz.double().cpu())
+        )
+
+
+@dataclass
+class EbarfDataParserConfig(DataParserConfig):
+    """A scene folder: scene.json, events, trajectory."""
+
+    _target: type = field(default_factory=lambda: EbarfDataParser)
+    data: Path = Path("scene")
+    """The scene folder."""
+
+
+@dataclass
+class EbarfDataParser(DataParser):
+    """Reads scene.json and the trajectory; the recording is left to the data manager."""
+
+    config: EbarfDataParserConfig
+
+    def __init__(self, config: EbarfDataParserConfig):
+        super().__init__(config)
+        with one_line_errors():
+            self.scene = read_scene(Path(config.data))
+            self.trajectory = read_tum(self.scene.trajectory)
+            self.normalization = _normalization(self.scene, self.trajectory)
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: object) -> DataparserOutputs:
+        keyframes = self.normalization.apply(self.trajectory)
+        cameras, files = self._keyframe_views(keyframes) if split == "train" else self._evaluation_views(keyframes)
+        translation = -self.normalization.centre[:, None]
+        return DataparserOutputs(
+            image_filenames=files,
+            cameras=cameras,
+            scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]])),
+            metadata={
+                "scene": self.scene,
+                "trajectory": self.trajectory,
+                "keyframes": keyframes,
+                "normalization": self.normalization,
+            },
+            dataparser_transform=torch.cat([torch.eye(3), translation.float()], dim=1),
+            dataparser_scale=self.normalization.scale,
+        )
+
+    def _keyframe_views(self, keyframes: Trajectory, every: int = 1) -> tuple[Cameras, list[Path]]:
+        chosen = Trajectory(keyframes.t_us[::every], Poses(*(column[::every] for column in keyframes.poses)))
+        files = [self.scene.folder / "keyframes" / f"{t_us}.png" for t_us in chosen.t_us.tolist()]
+        return _nerfstudio_cameras([self.scene.camera] * len(files), chosen), files
+
+    def _evaluation_views(self, keyframes: Trajectory) -> tuple[Cameras, list[Path]]:
+        """The frames within the trajectory's span, or else a few keyframes, so that there is something to look at."""
+        times = torch.tensor([frame.t_us for frame in self.scene.frames], dtype=torch.int64)
+        inside = within_span(times, keyframes.t_us)
+        frames = [frame for frame, keep in zip(self.scene.frames, inside.tolist(), strict=True) if keep]
+        if not frames:
+            return self._keyframe_views(keyframes, max(1, len(keyframes.t_us) // _STAND_IN_VIEWS))
+        event_camera = interpolate(keyframes.t_us, keyframes.poses, times[inside])
+        extrinsic = torch.tensor([frame.event_camera_from_frame_camera for frame in frames])
+        extrinsic[:, :3, 3] *= self.normalization.scale
+        rotation = event_camera.matrix()[:, :, :3] @ extrinsic[:, :3, :3]
+        position = event_camera.matrix()[:, :, :3] @ extrinsic[:, :3, 3:] + event_camera.position[..., None]
+        cameras = _nerfstudio_cameras(
+            [frame.camera for frame in frames], times[inside], torch.cat([rotation, position], dim=-1)
+        )
+        return cameras, [frame.path for frame in frames]
+
+
+def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:
+    if scene.bounds is not None:
+        lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
+        position = trajectory.poses.position
+        outside = ((position < lower) | (position > upper)).any(dim=-1)
+        if outside.all():
+            raise SceneError(
+                f"{scene.folder / 'scene.json'}: bounds {scene.bounds} hold none of the {len(position)} keyframes of "
+                f"{scene.trajectory.name}, the first of which is at {position[0].tolist()}; expected bounds around them"
+            )
+        return Normalization((lower + upper) / 2, 2 / float((upper - lower).max()))
+    centre = trajectory.poses.position.mean(dim=0)
+    radius = float((trajectory.poses.position - centre).norm(dim=-1).max())
+    return Normalization(centre, _TRAJECTORY_SHARE / radius if radius > 0 else 1.0)
+
+
+_OPENGL_FROM_OPENCV = torch.tensor([1.0, -1.0, -1.0, 1.0])
+
+
+def opengl_from_opencv(camera_to_world: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]:
+    """The same pose with nerfstudio's camera axes (y up, z backward); its own inverse."""
+    return camera_to_world * _OPENGL_FROM_OPENCV.to(camera_to_world)
+
+
+def _nerfstudio_cameras(
+    cameras: list[Camera], times: Trajectory | Tensor, camera_to_world: Tensor | None = None
+) -> Cameras:
+    if isinstance(times, Trajectory):
+        times, camera_to_world = times.t_us, times.poses.matrix()
+    assert camera_to_world is not None
+
+    def column(name: str) -> Tensor:
+        return torch.tensor([[getattr(camera, name)] for camera in cameras])
+
+    return Cameras(
+        camera_to_worlds=opengl_from_opencv(camera_to_world),
+        fx=column("fx"),
+        fy=column("fy"),
+        cx=column("cx") + 0.5,  # nerfstudio's pixel centres are at half integers
+        cy=column("cy") + 0.5,
+        width=column("width"),
+        height=column("height"),
+        distortion_params=torch.tensor([_nerfstudio_distortion(camera) for camera in cameras])
+        if any(camera.distortion for camera in cameras)
+        else None,
+        camera_type=[
+            CameraType.FISHEYE if camera.model == "equidistant" else CameraType.PERSPECTIVE for camera in cameras
+        ],
+        metadata={"camera_t_us": times[:, None]},
+    )
+
+
+def _nerfstudio_distortion(camera: Camera) -> list[float]:
+    """k1 k2 k3 k4 p1 p2."""
+    if camera.model == "radtan":
+        k1, k2, p1, p2, k3 = (*camera.distortion, 0.0)[:5]
+        return [k1, k2, k3, 0.0, p1, p2]
+    return [*camera.distortion, 0.0, 0.0] if camera.distortion else [0.0] * 6
+
+
+ebarf_data = DataParserSpecification(
+    config=EbarfDataParserConfig(), description="A scene folder of an event camera: scene.json, events, trajectory."
+)

@@ -1,0 +1,118 @@
+"""The camera optimizer that knows time: keyframe corrections, and world rays at any moment between keyframes."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor, nn
+
+from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
+from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate
+from ebarf_ns.nerf.dataparser import opengl_from_opencv
+
+
+@dataclass
+class TrajectoryOptimizerConfig(CameraOptimizerConfig):
+    """How the trajectory is corrected."""
+
+    _target: type = field(default_factory=lambda: TrajectoryOptimizer)
+    mode: Literal["refine", "off"] = "refine"  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Refine every keyframe, or keep the trajectory as it came."""
+    interpolation: Interpolation = "linear"
+    """Of positions between keyframes: linear (Eq. 3), or the natural cubic spline of the reference implementation."""
+
+
+class TrajectoryOptimizer(CameraOptimizer):
+    """Keyframe poses with a zero-initialised correction (rotation [rad], translation) each, in the camera's frame.
+
+    Called ``camera_optimizer`` in the model, so that nerfstudio's viewer and exporters show the refined poses.
+    """
+
+    config: TrajectoryOptimizerConfig
+
+    def __init__(
+        self,
+        config: TrajectoryOptimizerConfig,
+        num_cameras: int,
+        device: torch.device | str,
+        keyframes: Trajectory,
+        **kwargs: Any,
+    ):
+        super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
+        self.config = config
+        self.register_buffer("keyframe_t_us", keyframes.t_us.clone())
+        self.register_buffer("initial_position", keyframes.poses.position.clone())
+        self.register_buffer("initial_quat_wxyz", keyframes.poses.quat_wxyz.clone())
+        self.keyframe_t_us: Tensor
+        self.initial_position: Tensor
+        self.initial_quat_wxyz: Tensor
+        if config.mode == "refine":
+            self.correction = nn.Parameter(torch.zeros(len(keyframes.t_us), 6))
+
+    def initial(self) -> Poses:
+        """The keyframes as they came."""
+        return Poses(self.initial_position, self.initial_quat_wxyz)
+
+    def keyframes(self) -> Poses:
+        """The keyframes as corrected so far."""
+        return corrected(self.initial(), self.correction) if self.config.mode == "refine" else self.initial()
+
+    def trajectory(self) -> Trajectory:
+        """The corrected keyframes and their times, detached."""
+        poses = self.keyframes()
+        return Trajectory(self.keyframe_t_us, Poses(poses.position.detach(), poses.quat_wxyz.detach()))
+
+    def poses_at(self, t_us: Int[Tensor, "*batch"]) -> Poses:
+        """Corrected poses at given times."""
+        return interpolate(self.keyframe_t_us, self.keyframes(), t_us, self.config.interpolation)
+
+    def apply_to_raybundle(self, raybundle: RayBundle) -> None:
+        """Turn event rays, given in the camera's frame at their time, into world rays; others are world rays already."""
+        t_us = (raybundle.metadata or {}).pop("event_t_us", None)
+        if t_us is not None:
+            poses = self.poses_at(t_us[..., 0])
+            rotation = quat_wxyz_to_matrix(poses.quat_wxyz)
+            raybundle.directions = (rotation @ raybundle.directions[..., None])[..., 0]
+            raybundle.origins = poses.position
+
+    def forward(self, indices: Int[Tensor, "cameras"]) -> Float[Tensor, "cameras 3 4"]:
+        """From the refined to the initial camera frame of keyframes, nerfstudio's axes, to be multiplied on the right."""
+        flip = torch.tensor([1.0, -1.0, -1.0], device=self.keyframe_t_us.device)
+        initial, refined = (Poses(p.position[indices], p.quat_wxyz[indices]) for p in (self.initial(), self.keyframes()))
+        to_initial = quat_wxyz_to_matrix(initial.quat_wxyz).mT
+        rotation = to_initial @ quat_wxyz_to_matrix(refined.quat_wxyz)
+        position = (to_initial @ (refined.position - initial.position)[..., None])[..., 0]
+        return torch.cat([flip[:, None] * rotation * flip, (flip * position)[..., None]], dim=-1)
+
+    def apply_to_camera(self, camera: Cameras) -> Float[Tensor, "cameras 3 4"]:
+        """Camera-to-world of a dataset's camera moved along with the trajectory; of any other camera, as it is."""
+        camera_to_world = camera.camera_to_worlds
+        t_us = (camera.metadata or {}).get("camera_t_us")
+        if t_us is None:
+            return camera_to_world
+        t_us = t_us.to(self.keyframe_t_us.device)[..., 0]
+        initial = interpolate(self.keyframe_t_us, self.initial(), t_us).matrix()
+        refined = self.poses_at(t_us).matrix()
+        given = opengl_from_opencv(camera_to_world).to(refined)
+        local = initial[..., :3].mT @ torch.cat([given[..., :3], given[..., 3:] - initial[..., 3:]], dim=-1)
+        moved = refined[..., :3] @ local
+        moved = torch.cat([moved[..., :3], moved[..., 3:] + refined[..., 3:]], dim=-1)
+        return opengl_from_opencv(moved).to(camera_to_world)
+
+    def get_loss_dict(self, loss_dict: dict) -> None:
+        """No penalty: the gauge is free while training."""
+
+    def get_metrics_dict(self, metrics_dict: dict) -> None:
+        """Mean size of the corrections."""
+        if self.config.mode == "refine":
+            metrics_dict["correction_rotation_rad"] = self.correction[:, :3].detach().norm(dim=-1).mean()
+            metrics_dict["correction_translation"] = self.correction[:, 3:].detach().norm(dim=-1).mean()
+
+    def get_param_groups(self, param_groups: dict) -> None:
+        """The corrections, under nerfstudio's name for camera parameters."""
+        if self.config.mode == "refine":
+            param_groups["camera_opt"] = [self.correction]

@@ -1,0 +1,47 @@
+"""What the rendered change of log brightness should have been: the losses of Eq. 5 and Eq. 6."""
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+
+def reported_change(
+    polarity_sum: Int64[Tensor, "pairs"],
+    event_count: Int64[Tensor, "pairs"],
+    threshold_on: float,
+    threshold_off: float,
+) -> Float[Tensor, "pairs"]:
+    """Change of log brightness that the events in a pair report: C_on times those brighter - C_off times those darker."""
+    brighter = (event_count + polarity_sum) / 2
+    return brighter * threshold_on - (event_count - brighter) * threshold_off
+
+
+def threshold_loss(
+    change: Float[Tensor, "pairs"],
+    reported: Float[Tensor, "pairs"],
+    event_count: Int64[Tensor, "pairs"],
+    threshold: float,
+) -> Float[Tensor, ""]:
+    """Eq. 5 in units of the threshold, each pair weighted by one over its number of events; 0 for no pairs.
+
+    The errors of the single thresholds add up over the events of a pair, so its variance grows with their number.
+    """
+    residual = (change - reported) / threshold
+    return (residual * residual / event_count).sum() / max(len(change), 1)
+
+
+def normalized_loss(
+    change: Float[Tensor, "pairs"], reported: Float[Tensor, "pairs"], threshold: float = 0.25
+) -> Float[Tensor, ""]:
+    """Eq. 6 for unknown thresholds: both changes scaled to unit length over the batch before they are compared.
+
+    The paper writes the norm per event, where it would leave nothing but the sign; what its implementation computes,
+    and what works, is the norm over the batch. Smoothed by delta = 0.001 sqrt(N) C so that the gradient stays below
+    2 / delta at zero change. Fewer than two pairs or no net polarity carry no information: 0.
+    """
+    if len(change) < 2 or not bool(reported.any()):
+        return 0 * change.sum()
+    delta = 1e-3 * len(change) ** 0.5 * threshold
+    unit = change / (change.square().sum() + delta**2).sqrt()
+    difference = unit - reported / torch.linalg.vector_norm(reported)
+    return difference.square().sum()

@@ -1,0 +1,117 @@
+"""Where along a ray the field is asked, and how the answers add up (Max 1995; Mildenhall et al. 2020)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ebarf_ns.radiance.field import RadianceField, contract
+
+
+class Rays(NamedTuple):
+    """World rays with unit directions."""
+
+    origin: Float[Tensor, "rays 3"]
+    direction: Float[Tensor, "rays 3"]
+
+
+class Rendered(NamedTuple):
+    """What a ray sees."""
+
+    intensity: Float[Tensor, "rays"]
+    depth: Float[Tensor, "rays"]
+    accumulation: Float[Tensor, "rays"]
+    """Share of the light that comes from within the scene."""
+
+
+def leave_box(rays: Rays, half_side: float = 1.0) -> Float[Tensor, "rays"]:
+    """Distance at which each ray leaves the cube [-h, h]³ (its far side, also for origins outside)."""
+    away = torch.where(rays.direction.abs() < 1e-9, torch.full_like(rays.direction, 1e-9), rays.direction)
+    return torch.maximum((half_side - rays.origin) / away, (-half_side - rays.origin) / away).amin(-1)
+
+
+def uniform_edges(
+    near: float, far: Float[Tensor, "rays"], count: int, in_disparity: bool
+) -> Float[Tensor, "rays count+1"]:
+    """Interval edges from near to far, even in distance, or in its reciprocal for unbounded scenes."""
+    u = torch.linspace(0, 1, count + 1, device=far.device, dtype=far.dtype)
+    far = far[:, None].clamp_min(2 * near)
+    return 1 / ((1 - u) / near + u / far) if in_disparity else near + u * (far - near)
+
+
+def weights_of(
+    density: Float[Tensor, "rays samples"], edges: Float[Tensor, "rays samples+1"]
+) -> Float[Tensor, "rays samples"]:
+    """Share of a ray's light that comes from each interval: T_i (1 - exp(-density_i * length_i))."""
+    optical = density * edges.diff(dim=-1)
+    transmitted = torch.exp(-(optical.cumsum(-1) - optical))
+    return transmitted * -torch.expm1(-optical)
+
+
+def resample(
+    edges: Float[Tensor, "rays coarse+1"],
+    weights: Float[Tensor, "rays coarse"],
+    count: int,
+    jitter: Float[Tensor, "rays 1"],
+) -> Float[Tensor, "rays count+1"]:
+    """Edges of ``count`` new intervals, as dense as the weights are heavy; ``jitter`` in [0, 1) shifts them all."""
+    cumulative = torch.nn.functional.pad((weights / weights.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
+    inner = (torch.arange(count - 1, device=edges.device) + jitter + 0.5 * (1 - 1 / count)) / count
+    inner = inner.clamp(0, 1).contiguous()
+    upper = torch.searchsorted(cumulative, inner, right=True).clamp(1, edges.shape[-1] - 1)
+    c0, c1 = cumulative.gather(-1, upper - 1), cumulative.gather(-1, upper)
+    e0, e1 = edges.gather(-1, upper - 1), edges.gather(-1, upper)
+    fraction = ((inner - c0) / (c1 - c0).clamp_min(1e-12)).clamp(0, 1)
+    return torch.cat([edges[:, :1], e0 + fraction * (e1 - e0), edges[:, -1:]], dim=-1)
+
+
+class DensityGrid(nn.Module):
+    """A coarse memory of the field's density, so that finding out where to look costs no pass through the field."""
+
+    def __init__(self, cells: int, bounded: bool, refresh_share: int = 16):
+        super().__init__()
+        self.cells, self.half_side, self.refresh_share = cells, 1.0 if bounded else 2.0, refresh_share
+        self.register_buffer("density", torch.ones(cells**3))
+        self.density: Tensor
+
+    def reset(self) -> None:
+        """Back to knowing nothing."""
+        self.density.fill_(1.0)
+
+    @torch.no_grad()
+    def refresh(self, field: RadianceField, round_number: int, generator: torch.Generator) -> None:
+        """Look up the field at a jittered place in every ``refresh_share``-th cell, other cells in each round."""
+        cell = torch.arange(round_number % self.refresh_share, self.cells**3, self.refresh_share)
+        cell = cell.to(self.density.device)
+        index = torch.stack([cell % self.cells, cell // self.cells % self.cells, cell // self.cells**2], dim=-1)
+        jitter = torch.rand(index.shape, generator=generator).to(index.device)
+        unit = (index + jitter) / self.cells
+        self.density[cell] = torch.maximum(0.7 * self.density[cell], field.density_in_unit_cube(unit))
+
+    def lookup(self, point: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The remembered density; for contracted scenes, ``point`` is contracted here."""
+        point = contract(point) if self.half_side > 1 else point
+        scaled = ((point / self.half_side + 1) * (self.cells / 2)).long().clamp(0, self.cells - 1)
+        x, y, z = scaled.unbind(-1)
+        return self.density[x + self.cells * (y + self.cells * z)]
+
+
+def composite(
+    field: RadianceField,
+    rays: Rays,
+    edges: Float[Tensor, "rays samples+1"],
+    background: Float[Tensor, ""] | float,
+) -> Rendered:
+    """Ask the field at the middle of each interval and sum up (Eq. 4)."""
+    middle = (edges[:, 1:] + edges[:, :-1]) / 2
+    point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
+    direction = rays.direction[:, None].expand_as(point).flatten(0, 1) if field.view_dependent else None
+    density, intensity = field(point.flatten(0, 1), direction)
+    weights = weights_of(density.view_as(middle), edges)
+    accumulation = weights.sum(-1)
+    return Rendered(
+        (weights * intensity.view_as(middle)).sum(-1) + (1 - accumulation) * background,
+        (weights * middle).sum(-1) + (1 - accumulation) * edges[:, -1],
+        accumulation,
+    )
