@@ -1,0 +1,22 @@
+"""How well a render predicts the events that it was not trained on."""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def unexplained_share(
+    change: Float[np.ndarray, "pairs"], reported: Float[np.ndarray, "pairs"], event_count: Float[np.ndarray, "pairs"]
+) -> float:
+    """Share of the reported brightness changes that the rendered ones leave unexplained: 0 is perfect, 1 is nothing.
+
+    min over a of sum w (r - a c)² / sum w r², w = 1 / events in the pair: one gain is fitted, since events leave the
+    scale of log brightness open where the threshold is unknown, so that the number compares methods and sensors.
+    """
+    weight = 1 / event_count
+    total = float((weight * reported**2).sum())
+    if total == 0:
+        return float("nan")
+    energy = float((weight * change**2).sum())
+    shared = float((weight * change * reported).sum())
+    # A render that moves against the events explains nothing of them.
+    return 1 - max(shared, 0.0) ** 2 / (energy * total) if energy > 0 else 1.0

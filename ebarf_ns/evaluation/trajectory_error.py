@@ -1,0 +1,99 @@
+"""How far a trajectory is from a reference, through the evo library."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from evo.core import metrics
+from evo.core.geometry import GeometryException
+from evo.core.trajectory import PosePath3D
+from scipy.spatial.transform import Rotation, Slerp
+
+from ebarf_ns.errors import EvaluationError
+from ebarf_ns.geometry.trajectory import Trajectory
+
+Alignment = Literal["se3", "sim3"]
+ALIGNMENTS: tuple[Alignment, ...] = ("se3", "sim3")
+
+
+@dataclass(frozen=True)
+class TrajectoryError:
+    """Errors after one alignment of the estimate to the reference (Umeyama 1991)."""
+
+    ate_m: float
+    """Root mean square of the position errors."""
+    rotation_deg: float
+    """Root mean square of the rotation errors, after their mean rotation in the world frame is removed."""
+    rotation_deg_body: float
+    """The same, after one constant rotation of the body is solved for as well."""
+    ape_full: float
+    """Mean of evo's unit-less full transformation error, the number of the E-BARF paper's Table 2."""
+    scale: float
+    matched: int
+
+
+def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Alignment) -> TrajectoryError:
+    """Compare at the estimate's times within the reference's span, where the reference is interpolated.
+
+    Raises :class:`EvaluationError` where no alignment is defined: fewer than 3 poses, on a line, or without motion.
+    """
+    estimated, true = _matched(estimate, reference)
+    try:
+        rotation, position, scale = estimated.align(true, correct_scale=alignment == "sim3")
+    except GeometryException as error:
+        raise EvaluationError(
+            f"the trajectory cannot be aligned to the reference: {error} (its {estimated.num_poses} matched "
+            "positions lie on a line or in a point; expected motion in at least 2 directions)"
+        ) from None
+    del rotation, position
+    errors = {}
+    for name, relation in (
+        ("ate_m", metrics.PoseRelation.translation_part),
+        ("ape_full", metrics.PoseRelation.full_transformation),
+    ):
+        ape = metrics.APE(relation)
+        ape.process_data((true, estimated))
+        errors[name] = ape.get_statistic(
+            metrics.StatisticsType.rmse if name == "ate_m" else metrics.StatisticsType.mean
+        )
+    turned, straight = (Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3]) for path in (estimated, true))
+    return TrajectoryError(
+        ate_m=float(errors["ate_m"]),
+        rotation_deg=_rotation_error_deg(turned, straight, iterations=0),
+        rotation_deg_body=_rotation_error_deg(turned, straight, iterations=20),
+        ape_full=float(errors["ape_full"]),
+        scale=float(scale),
+        matched=int(estimated.num_poses),
+    )
+
+
+def _rotation_error_deg(estimate: Rotation, true: Rotation, iterations: int) -> float:
+    """RMSE of true = world * estimate * body with the best world rotation, and by alternation the best body one."""
+    body = Rotation.identity()
+    world = (true * estimate.inv()).mean()
+    for _ in range(iterations):
+        body = ((world * estimate).inv() * true).mean()
+        world = (true * (estimate * body).inv()).mean()
+    errors = (world * estimate * body).inv() * true
+    return float(np.degrees(np.sqrt(np.mean(errors.magnitude() ** 2))))
+
+
+def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, PosePath3D]:
+    t_us, reference_t_us = estimate.t_us.numpy(), reference.t_us.numpy()
+    inside = (t_us >= reference_t_us[0]) & (t_us <= reference_t_us[-1])
+    if inside.sum() < 3:
+        raise EvaluationError(
+            f"{inside.sum()} of {len(t_us)} poses lie within the reference's span, {reference_t_us[0]} to "
+            f"{reference_t_us[-1]} us; expected at least 3"
+        )
+    # Relative times are exact in float64.
+    t = (t_us[inside] - reference_t_us[0]).astype(float)
+    reference_t = (reference_t_us - reference_t_us[0]).astype(float)
+    reference_position, reference_quat_wxyz = (column.double().numpy() for column in reference.poses)
+    position = np.stack([np.interp(t, reference_t, axis) for axis in reference_position.T], axis=1)
+    quat_xyzw = Slerp(reference_t, Rotation.from_quat(reference_quat_wxyz[:, [1, 2, 3, 0]]))(t).as_quat()
+    estimated_position, estimated_quat_wxyz = (column.double().numpy()[inside] for column in estimate.poses)
+    return (
+        PosePath3D(estimated_position.copy(), estimated_quat_wxyz.copy()),
+        PosePath3D(position, quat_xyzw[:, [3, 0, 1, 2]]),
+    )

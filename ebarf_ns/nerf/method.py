@@ -1,0 +1,98 @@
+"""The methods that ns-train offers: ebarf, and as yardsticks ebarf-paper and enerf."""
+
+import torch
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from ebarf_ns.nerf.datamanager import EventDataManagerConfig
+from ebarf_ns.nerf.model import EbarfModelConfig
+from ebarf_ns.nerf.pipeline import EbarfPipelineConfig
+from ebarf_ns.nerf.trainer import BudgetDecayConfig, EbarfTrainerConfig, FusedAdamConfig
+from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizerConfig
+
+
+def _trainer(
+    method_name: str,
+    datamanager: EventDataManagerConfig,
+    model: EbarfModelConfig,
+    field_rate: float,
+    pose_rate: float,
+    restart_field_at: float | None = None,
+) -> EbarfTrainerConfig:
+    return EbarfTrainerConfig(
+        method_name=method_name,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        max_num_iterations=6000,
+        restart_field_at=restart_field_at,
+        # Evaluation goes by the budget, see EbarfTrainerConfig.evaluations.
+        steps_per_eval_batch=10**9,
+        steps_per_eval_image=10**9,
+        steps_per_eval_all_images=10**9,
+        steps_per_save=1000,
+        mixed_precision=False,
+        pipeline=EbarfPipelineConfig(datamanager=datamanager, model=model),
+        optimizers={
+            "fields": {
+                "optimizer": FusedAdamConfig(lr=field_rate, eps=1e-15),
+                "scheduler": BudgetDecayConfig(),
+            },
+            "camera_opt": {
+                "optimizer": FusedAdamConfig(lr=pose_rate, betas=(0.9, 0.99)),
+                "scheduler": BudgetDecayConfig(),
+            },
+        },
+        logging=LoggingConfig(steps_per_log=10),
+        viewer=ViewerConfig(num_rays_per_chunk=4096),
+        vis="viewer",
+    )
+
+
+def _paper_model(mode: str) -> EbarfModelConfig:
+    return EbarfModelConfig(
+        camera_optimizer=TrajectoryOptimizerConfig(mode=mode),  # pyright: ignore[reportArgumentType]
+        loss="normalized",
+        brightness="lin_log",
+        intensity_range="unit",
+        view_dependent=True,
+        sampling="uniform",
+        samples=96,
+        grid_levels=16,
+        grid_features=2,
+        grid_coarsest=16,
+        grid_finest=512,
+    )
+
+
+ebarf = MethodSpecification(
+    config=_trainer(
+        "ebarf",
+        EventDataManagerConfig(),
+        EbarfModelConfig(),
+        field_rate=1e-2,
+        pose_rate=1e-3,
+        restart_field_at=0.3,
+    ),
+    description="NeRF from an event camera and its imperfect trajectory, which is refined on the way.",
+)
+
+ebarf_paper = MethodSpecification(
+    config=_trainer(
+        "ebarf-paper",
+        EventDataManagerConfig(longest_pair=1),
+        _paper_model("refine"),
+        field_rate=5e-3,
+        pose_rate=1e-3,
+    ),
+    description="E-BARF as published: consecutive event pairs, uniform samples, normalised loss.",
+)
+
+enerf = MethodSpecification(
+    config=_trainer(
+        "enerf",
+        EventDataManagerConfig(longest_pair=1),
+        _paper_model("off"),
+        field_rate=5e-3,
+        pose_rate=1e-3,
+    ),
+    description="E-NeRF: ebarf-paper with the poses frozen.",
+)

@@ -1,0 +1,206 @@
+"""The picture of the method: event pair, two poses, two rays, two intensities, one difference, one loss."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor
+
+from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
+from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
+from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss
+from ebarf_ns.radiance.field import IntensityRange, RadianceField
+from ebarf_ns.radiance.hash_grid import HashGridShape
+from ebarf_ns.radiance.ray_sampling import (
+    DensityGrid,
+    Rays,
+    composite,
+    leave_box,
+    resample,
+    uniform_edges,
+    weights_of,
+)
+from ebarf_ns.scene import Scene
+
+_FAR_UNBOUNDED = 1e3
+_BACKGROUND = 0.5
+
+
+@dataclass
+class EbarfModelConfig(ModelConfig):
+    """An event-loss NeRF that corrects its own trajectory."""
+
+    _target: type = field(default_factory=lambda: EbarfModel)
+    eval_num_rays_per_chunk: int = 4096
+    camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
+    loss: Literal["auto", "threshold", "normalized"] = "auto"
+    """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; auto takes Eq. 5 where scene.json has them."""
+    brightness: BrightnessKind = "log"
+    """Log brightness of an intensity: lin_log is Eq. 2."""
+    intensity_range: IntensityRange = "positive"
+    """Of the field: unit is a sigmoid, positive an exponential."""
+    view_dependent: bool = False
+    """Let intensity depend on the viewing direction."""
+    grid_levels: int = 8
+    grid_features: int = 4
+    grid_coarsest: int = 8
+    grid_finest: int = 192
+    """Cells per side of the finest level: about twice the scene's size over a pixel's footprint."""
+    grid_table_size_log2: int = 17
+    sampling: Literal["importance", "uniform"] = "importance"
+    """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
+    samples: int = 48
+    """Points per ray at which the field is asked."""
+    coarse_samples: int = 128
+    """Points per ray at which the remembered density is looked up for importance sampling."""
+    uniform_share: float = 0.1
+    """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
+    density_cells: int = 96
+    """Cells per side of the remembered density."""
+    near: float = 0.02
+    """Distance at which rays begin, in units of half the scene's size."""
+    density_bias: float = 0.0
+    """Log density at the start of training."""
+
+
+class EbarfModel(Model):
+    """Renders rays, and compares the two ends of each event pair."""
+
+    config: EbarfModelConfig
+
+    def populate_modules(self) -> None:
+        """Build what the scene needs and nothing else."""
+        super().populate_modules()
+        config, scene = self.config, self.kwargs["metadata"]["scene"]
+        assert isinstance(scene, Scene)
+        threshold = scene.contrast_threshold
+        self.normalized = config.loss == "normalized" or (config.loss == "auto" and threshold is None)
+        # Without thresholds, polarities are compared in units of one common threshold.
+        self.thresholds = (threshold.on, threshold.off) if threshold and not self.normalized else (1.0, 1.0)
+        bounded = scene.bounds is not None
+        shape = HashGridShape(
+            config.grid_levels,
+            config.grid_features,
+            config.grid_coarsest,
+            config.grid_finest,
+            config.grid_table_size_log2,
+        )
+        self.field = RadianceField(
+            shape, bounded, config.view_dependent, config.intensity_range, density_bias=config.density_bias
+        )
+        if config.sampling == "importance":
+            self.density_grid = DensityGrid(config.density_cells, bounded)
+        self.camera_optimizer: TrajectoryOptimizer = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data,
+            device="cpu",
+            keyframes=self.kwargs["metadata"]["keyframes"],
+        )
+        self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
+        self.display_range: Tensor
+        self.random = torch.Generator()
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Two groups: fields, and camera_opt for the keyframe corrections."""
+        groups = {"fields": list(self.field.parameters())}
+        self.camera_optimizer.get_param_groups(groups)
+        return groups
+
+    def begin_step(self, step: int, seed: int) -> None:
+        """Random numbers are a function of seed and step, so that a resumed run continues as if never stopped."""
+        self.random.manual_seed(seed * 1_000_003 + step)
+        if self.config.sampling == "importance" and (step < 16 or step % 8 == 0):
+            self.density_grid.refresh(self.field, step if step < 16 else step // 8, self.random)
+
+    def restart_field(self) -> None:
+        """Forget the field and keep the poses."""
+        self.field.reset()
+        if self.config.sampling == "importance":
+            self.density_grid.reset()
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Rendered intensity, depth and accumulation, and a grey picture of the log brightness for people."""
+        self.camera_optimizer.apply_to_raybundle(ray_bundle)
+        rays = Rays(ray_bundle.origins, ray_bundle.directions)
+        rendered = composite(self.field, rays, self.sample_edges(rays), _BACKGROUND)
+        brightness = log_brightness(rendered.intensity, self.config.brightness)
+        if self.training:
+            self._follow_display_range(brightness.detach())
+        low, high = self.display_range
+        grey = ((brightness.detach() - low) / (high - low)).clamp(0, 1)
+        return {
+            "rgb": grey[:, None].expand(-1, 3),
+            "intensity": rendered.intensity[:, None],
+            "brightness": brightness[:, None],
+            "depth": rendered.depth[:, None],
+            "accumulation": rendered.accumulation[:, None],
+        }
+
+    def get_loss_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor], metrics_dict: Any = None) -> dict:
+        """The change of log brightness between the two rays of each pair, against what its events report."""
+        before, after = outputs["brightness"][:, 0].chunk(2)
+        change = after - before
+        reported = reported_change(batch["polarity_sum"], batch["event_count"], *self.thresholds).to(change)
+        if self.normalized:
+            return {"event_loss": normalized_loss(change, reported)}
+        return {"event_loss": threshold_loss(change, reported, batch["event_count"], sum(self.thresholds) / 2)}
+
+    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """How opaque the scene is, and how far the keyframes have moved."""
+        metrics = {"accumulation": outputs["accumulation"].detach().mean()}
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def sample_edges(self, rays: Rays) -> Float[Tensor, "rays samples+1"]:
+        """Where to ask the field; in training the two rays of a pair share distances and jitter.
+
+        The loss looks at their difference: whatever differs between the two but the pose is noise in exactly that.
+        """
+        config, count = self.config, len(rays.origin)
+        with torch.no_grad():
+            far = leave_box(rays) if self.field.bounded else torch.full_like(rays.origin[:, 0], _FAR_UNBOUNDED)
+            if self.training:
+                far = far.view(2, -1).amax(0).repeat(2)
+                jitter = torch.rand(count // 2, 1, generator=self.random).to(far.device).repeat(2, 1) - 0.5
+            else:
+                jitter = torch.zeros(count, 1, device=far.device)
+            importance = config.sampling == "importance"
+            coarse = config.coarse_samples if importance else config.samples
+            edges = uniform_edges(config.near, far, coarse, in_disparity=not self.field.bounded)
+            if not importance:
+                weights = torch.ones_like(edges[:, 1:])
+                return resample(edges, weights, config.samples, jitter)
+            middle = (edges[:, 1:] + edges[:, :-1]) / 2
+            point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
+            weights = weights_of(self.density_grid.lookup(point), edges)
+            if self.training:
+                weights = weights.view(2, -1, coarse).mean(0).repeat(2, 1)
+            # What passes through the scene is spread evenly too.
+            spread = config.uniform_share + (1 - weights.sum(-1, keepdim=True)).clamp_min(0)
+            return resample(edges, weights + spread / coarse, config.samples, jitter)
+
+    def _follow_display_range(self, brightness: Float[Tensor, "rays"]) -> None:
+        low, high = torch.quantile(brightness, torch.tensor([0.02, 0.98], device=brightness.device))
+        self.display_range.lerp_(torch.stack([low, torch.maximum(high, low + 0.1)]), 0.05)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Grey with the true accumulation as alpha, so that exported point clouds leave empty space empty."""
+        return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Render a camera; a dataset's own cameras are rendered from where the refined trajectory puts them."""
+        moved = camera[...]
+        moved.camera_to_worlds = self.camera_optimizer.apply_to_camera(camera).detach()
+        return super().get_outputs_for_camera(moved, obb_box)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Pictures for nerfstudio's logs; the numbers come from the pipeline, over all frames at once."""
+        depth = outputs["depth"] / outputs["depth"].amax()
+        reference = batch["image"].to(outputs["rgb"])
+        return {}, {"img": torch.cat([reference, outputs["rgb"]], dim=1), "depth": depth.expand(-1, -1, 3)}

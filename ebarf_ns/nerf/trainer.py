@@ -1,0 +1,257 @@
+"""Training within a budget of steps or seconds, with every evaluation on record and nothing half written."""
+
+import json
+import platform
+import resource
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import torch
+import yaml
+from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from ebarf_ns.errors import TrainingError, one_line_errors
+from ebarf_ns.files import whole_file
+from ebarf_ns.geometry.trajectory_file import write_tum
+from ebarf_ns.nerf.pipeline import EbarfPipeline
+
+_SKIPPED_IN_A_ROW = 10
+
+
+@dataclass
+class FusedAdamConfig(OptimizerConfig):
+    """Adam with one pass over memory per step."""
+
+    _target: type = torch.optim.Adam
+    betas: tuple[float, float] = (0.9, 0.99)
+    fused: bool = True
+
+
+@dataclass
+class BudgetDecayConfig(SchedulerConfig):
+    """Exponential decay over the budget of the run, whether it is counted in steps or in seconds."""
+
+    _target: type = field(default_factory=lambda: BudgetDecayScheduler)
+    lr_final_ratio: float = 0.1
+    """Learning rate at the end over that at the start."""
+
+
+class BudgetDecay(LambdaLR):
+    """Follows ``progress``, the used fraction of the budget, which the trainer sets before every step."""
+
+    progress: float = 0.0
+
+    def __init__(self, optimizer: Optimizer, final_ratio: float):
+        super().__init__(optimizer, lambda _: float(final_ratio**self.progress))
+
+
+class BudgetDecayScheduler(Scheduler):
+    """Makes :class:`BudgetDecay`."""
+
+    config: BudgetDecayConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> BudgetDecay:
+        """The scheduler of one optimizer."""
+        return BudgetDecay(optimizer, self.config.lr_final_ratio)
+
+
+class GuardedOptimizers(Optimizers):
+    """Steps all groups, or none where any gradient is not finite: one bad batch must not poison Adam's moments."""
+
+    skipped = 0
+    skipped_in_a_row = 0
+
+    def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
+        """Raises :class:`TrainingError` when too many steps in a row had to be skipped."""
+        gradients = [p.grad for group in param_groups for p in self.parameters[group] if p.grad is not None]
+        if all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
+            self.skipped_in_a_row = 0
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+            return
+        self.skipped += 1
+        self.skipped_in_a_row += 1
+        if self.skipped_in_a_row >= _SKIPPED_IN_A_ROW:
+            raise TrainingError(f"{_SKIPPED_IN_A_ROW} training steps in a row had gradients that are not finite")
+
+
+@dataclass
+class EbarfTrainerConfig(TrainerConfig):
+    """A nerfstudio training run with a budget."""
+
+    _target: type = field(default_factory=lambda: EbarfTrainer)
+    max_train_seconds: float | None = None
+    """End after this many seconds of training, evaluation and loading excluded; all schedules follow."""
+    evaluations: int = 8
+    """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
+    restart_field_at: float | None = 0.3
+    """Fraction of the budget after which the field starts again with the poses refined so far; None: never."""
+
+
+class EbarfTrainer(Trainer):
+    """Follows the budget, evaluates along the way, and leaves trajectories and metrics in the run's folder."""
+
+    config: EbarfTrainerConfig
+    pipeline: EbarfPipeline
+
+    def setup(self, test_mode: Any = "val") -> None:
+        """Build pipeline and optimizers; what a user can cause ends in one line."""
+        self.train_seconds = 0.0
+        self.event_pairs = 0
+        self.steps_done = 0
+        self.field_restarted = False
+        with one_line_errors():
+            super().setup(test_mode)
+            if self.progress() >= 1:
+                raise TrainingError(
+                    f"the loaded run has used its budget of {self.config.max_num_iterations} steps; "
+                    "expected a larger --max-num-iterations or --max-train-seconds to go on"
+                )
+
+    def setup_optimizers(self) -> GuardedOptimizers:
+        """One optimizer for each parameter group."""
+        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+
+    def progress(self) -> float:
+        """Used fraction of the budget, by steps or seconds, whichever is further."""
+        by_steps = self.steps_done / self.config.max_num_iterations
+        seconds = self.config.max_train_seconds
+        return max(by_steps, self.train_seconds / seconds if seconds else 0.0)
+
+    def train(self) -> None:
+        """Train to the end of the budget."""
+        with one_line_errors():
+            write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
+            self._record_metrics(self._header())
+            super().train()
+
+    def train_iteration(self, step: int) -> Any:
+        """One step, its share of the budget, and the evaluation that may be due after it."""
+        started = monotonic()
+        before = self.progress()
+        for scheduler in self.optimizers.schedulers.values():
+            if isinstance(scheduler, BudgetDecay):
+                scheduler.progress = before
+        restart_at = self.config.restart_field_at
+        if restart_at is not None and before >= restart_at and not self.field_restarted:
+            self._restart_field()
+        result = super().train_iteration(step)
+        self.steps_done = step + 1
+        self.train_seconds += monotonic() - started
+        self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2
+        after = self.progress()
+        if int(after * self.config.evaluations) > int(before * self.config.evaluations) or after >= 1:
+            self._evaluate(step, float(result[0].detach()))
+        if after >= 1:
+            self.stop_training = True
+        return result
+
+    def _restart_field(self) -> None:
+        """A field trained under wrong poses holds them in place: learn it anew under the refined ones."""
+        self.field_restarted = True
+        self.pipeline.model.restart_field()
+        self.optimizers.optimizers["fields"].state.clear()
+
+    @check_main_thread
+    def _evaluate(self, step: int, loss: float) -> None:
+        final = self.progress() >= 1
+        results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
+        record = {
+            "step": self.steps_done,
+            "train_seconds": round(self.train_seconds, 3),
+            "event_pairs": self.event_pairs,
+            "loss": loss,
+            **results,
+            "skipped_steps": getattr(self.optimizers, "skipped", 0),
+            "peak_memory_mib": round(_peak_memory_mib(), 1),
+        }
+        self._record_metrics(record)
+        write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
+        numbers = {name: value for name, value in results.items() if value is not None}
+        writer.put_dict(name="Evaluation", scalar_dict=numbers, step=step)
+        shown = "  ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        CONSOLE.print(f"step {self.steps_done}, {self.train_seconds:.1f} s, {self.event_pairs:,} pairs:  {shown}")
+
+    @check_main_thread
+    def _record_metrics(self, record: dict[str, Any]) -> None:
+        path = self.base_dir / "metrics.jsonl"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+
+    def _header(self) -> dict[str, Any]:
+        device = torch.cuda.get_device_name() if self.device.startswith("cuda") else platform.processor() or "cpu"
+        scene = self.pipeline.scene
+        return {
+            "versions": {name: version(name) for name in ("ebarf_ns", "nerfstudio", "torch", "numpy")},
+            "method": self.config.method_name,
+            "device": device,
+            "threads": torch.get_num_threads(),
+            "seed": self.pipeline.datamanager.config.seed,
+            "scene": str(scene.folder),
+            "scene_digest": _digest((scene.folder / "scene.json").read_bytes() + scene.trajectory.read_bytes()),
+            "config_digest": _digest(yaml.dump(asdict(self.config)).encode()),
+        }
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Write the checkpoint whole, then remove older ones; the step is the last one done."""
+        step = max(self.steps_done - 1, 0)
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
+            "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+            "ebarf": {
+                "train_seconds": self.train_seconds,
+                "event_pairs": self.event_pairs,
+                "field_restarted": self.field_restarted,
+            },
+        }
+        # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
+        with whole_file(self.base_dir / path.name) as temporary:
+            torch.save(state, temporary)
+        (self.base_dir / path.name).replace(path)
+        if self.config.save_only_latest_checkpoint:
+            for old in self.checkpoint_dir.glob("step-*.ckpt"):
+                if old != path:
+                    old.unlink()
+
+    def _load_checkpoint(self) -> None:
+        super()._load_checkpoint()
+        path = self._loaded_path()
+        if path is not None:
+            state = torch.load(path, map_location="cpu")
+            for name, value in state.get("ebarf", {}).items():
+                setattr(self, name, value)
+            self.steps_done = self._start_step
+
+    def _loaded_path(self) -> Path | None:
+        if self.config.load_dir is not None:
+            steps = sorted(self.config.load_dir.glob("step-*.ckpt"))
+            step = self.config.load_step
+            return self.config.load_dir / f"step-{step:09d}.ckpt" if step is not None else steps[-1]
+        return self.config.load_checkpoint
+
+
+def _peak_memory_mib() -> float:
+    if torch.cuda.is_available():
+        return torch.cuda.max_memory_allocated() / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _digest(content: bytes) -> str:
+    return sha256(content).hexdigest()[:16]
