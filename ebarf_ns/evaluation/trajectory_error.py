@@ -6,24 +6,24 @@ from typing import Literal
 import numpy as np
 from evo.core import metrics
 from evo.core.geometry import GeometryException
+from evo.core.lie_algebra import se3
 from evo.core.trajectory import PosePath3D
 from scipy.spatial.transform import Rotation, Slerp
 
 from ebarf_ns.errors import EvaluationError
 from ebarf_ns.geometry.trajectory import Trajectory
 
-Alignment = Literal["se3", "sim3"]
-ALIGNMENTS: tuple[Alignment, ...] = ("se3", "sim3")
+Alignment = Literal["se3", "sim3", "orientation"]
 
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Errors after one alignment of the estimate to the reference (Umeyama 1991)."""
+    """Errors after one alignment of the estimate to the reference."""
 
     ate_m: float
     """Root mean square of the position errors."""
     rotation_deg: float
-    """Root mean square of the rotation errors, after their mean rotation in the world frame is removed."""
+    """Root mean square of the rotation errors after the best world rotation, which is their own, not that of ate_m."""
     rotation_deg_body: float
     """The same, after one constant rotation of the body is solved for as well."""
     ape_full: float
@@ -35,36 +35,55 @@ class TrajectoryError:
 def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Alignment) -> TrajectoryError:
     """Compare at the estimate's times within the reference's span, where the reference is interpolated.
 
-    Raises :class:`EvaluationError` where no alignment is defined: fewer than 3 poses, on a line, or without motion.
+    ``se3`` and ``sim3`` align the positions (Umeyama 1991). ``orientation`` rotates by the mean difference of the
+    rotations and fits place and scale, which is defined for motion along a line too. Raises :class:`EvaluationError`
+    where the alignment is not defined: fewer than 3 poses, no motion, or for Umeyama's a line.
     """
     estimated, true = _matched(estimate, reference)
-    try:
-        rotation, position, scale = estimated.align(true, correct_scale=alignment == "sim3")
-    except GeometryException as error:
-        raise EvaluationError(
-            f"the trajectory cannot be aligned to the reference: {error} (its {estimated.num_poses} matched "
-            "positions lie on a line or in a point; expected motion in at least 2 directions)"
-        ) from None
-    del rotation, position
-    errors = {}
-    for name, relation in (
-        ("ate_m", metrics.PoseRelation.translation_part),
-        ("ape_full", metrics.PoseRelation.full_transformation),
-    ):
-        ape = metrics.APE(relation)
-        ape.process_data((true, estimated))
-        errors[name] = ape.get_statistic(
-            metrics.StatisticsType.rmse if name == "ate_m" else metrics.StatisticsType.mean
-        )
     turned, straight = (Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3]) for path in (estimated, true))
+    if alignment == "orientation":
+        scale = _align_by_orientation(estimated, true, (straight * turned.inv()).mean())
+    else:
+        try:
+            _, _, scale = estimated.align(true, correct_scale=alignment == "sim3")
+        except GeometryException as error:
+            raise EvaluationError(
+                f"the trajectory cannot be aligned to the reference: {error} (the {estimated.num_poses} matched "
+                "positions lie on a line or in a point; expected motion in at least 2 directions)"
+            ) from None
+    position_error, full_error = (
+        _absolute_error(estimated, true, relation)
+        for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.full_transformation)
+    )
     return TrajectoryError(
-        ate_m=float(errors["ate_m"]),
+        ate_m=float(position_error.get_statistic(metrics.StatisticsType.rmse)),
         rotation_deg=_rotation_error_deg(turned, straight, iterations=0),
         rotation_deg_body=_rotation_error_deg(turned, straight, iterations=20),
-        ape_full=float(errors["ape_full"]),
+        ape_full=float(full_error.get_statistic(metrics.StatisticsType.mean)),
         scale=float(scale),
         matched=int(estimated.num_poses),
     )
+
+
+def _absolute_error(estimated: PosePath3D, true: PosePath3D, relation: metrics.PoseRelation) -> metrics.APE:
+    error = metrics.APE(relation)
+    error.process_data((true, estimated))
+    return error
+
+
+def _align_by_orientation(estimated: PosePath3D, true: PosePath3D, world: Rotation) -> float:
+    """Rotate, scale and shift ``estimated`` in place; returns the scale."""
+    moved = world.apply(estimated.positions_xyz)
+    offset, goal = moved - moved.mean(axis=0), true.positions_xyz - true.positions_xyz.mean(axis=0)
+    if not (offset**2).sum() > 0 or not (goal**2).sum() > 0:
+        raise EvaluationError("the trajectory or its reference does not move, expected motion to align")
+    scale = float((offset * goal).sum() / (offset**2).sum())
+    if scale <= 0:
+        raise EvaluationError("the trajectory moves against its reference, no positive scale aligns them")
+    estimated.transform(se3(world.as_matrix(), np.zeros(3)))
+    estimated.scale(scale)
+    estimated.transform(se3(np.eye(3), true.positions_xyz.mean(axis=0) - estimated.positions_xyz.mean(axis=0)))
+    return scale
 
 
 def _rotation_error_deg(estimate: Rotation, true: Rotation, iterations: int) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+import tyro
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -84,8 +85,8 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
     heldout_share: float = 0.05
     """Share of the recording's time whose events are kept for heldout_event_loss."""
-    seed: int = 0
-    """Batch number k of a seed is always the same batch."""
+    seed: tyro.conf.Suppress[int] = 0
+    """Set by the trainer to --machine.seed; batch number k of a seed is always the same batch."""
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):

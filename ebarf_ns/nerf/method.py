@@ -49,7 +49,7 @@ def _trainer(
 
 def _paper_model(mode: str) -> EbarfModelConfig:
     return EbarfModelConfig(
-        camera_optimizer=TrajectoryOptimizerConfig(mode=mode),  # pyright: ignore[reportArgumentType]
+        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False),  # pyright: ignore[reportArgumentType]
         loss="normalized",
         brightness="lin_log",
         intensity_range="unit",

@@ -19,10 +19,10 @@ from ebarf_ns.radiance.hash_grid import HashGridShape
 from ebarf_ns.radiance.ray_sampling import (
     DensityGrid,
     Rays,
+    coarse_edges,
     composite,
     leave_box,
     resample,
-    uniform_edges,
     weights_of,
 )
 from ebarf_ns.scene import Scene
@@ -62,8 +62,8 @@ class EbarfModelConfig(ModelConfig):
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
     density_cells: int = 96
     """Cells per side of the remembered density."""
-    near: float = 0.02
-    """Distance at which rays begin, in units of half the scene's size."""
+    near: float = 0.05
+    """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
     density_bias: float = 0.0
     """Log density at the start of training."""
 
@@ -170,7 +170,7 @@ class EbarfModel(Model):
                 jitter = torch.zeros(count, 1, device=far.device)
             importance = config.sampling == "importance"
             coarse = config.coarse_samples if importance else config.samples
-            edges = uniform_edges(config.near, far, coarse, in_disparity=not self.field.bounded)
+            edges = coarse_edges(config.near, far, coarse, self.field.bounded)
             if not importance:
                 weights = torch.ones_like(edges[:, 1:])
                 return resample(edges, weights, config.samples, jitter)

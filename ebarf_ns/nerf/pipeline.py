@@ -13,7 +13,7 @@ from torch import Tensor
 from ebarf_ns.errors import EvaluationError, one_line_errors
 from ebarf_ns.evaluation.frames import fit_brightness, image_errors, read_frame
 from ebarf_ns.evaluation.heldout import unexplained_share
-from ebarf_ns.evaluation.trajectory_error import trajectory_error
+from ebarf_ns.evaluation.trajectory_error import Alignment, trajectory_error
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
@@ -21,6 +21,9 @@ from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization
 from ebarf_ns.nerf.model import EbarfModel
 from ebarf_ns.scene import Frame, Scene
+
+_ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
+"""How refined and reference trajectory are aligned, and the suffix that says so in the results."""
 
 
 @dataclass
@@ -107,15 +110,18 @@ class EbarfPipeline(VanillaPipeline):
             return {}
         reference, estimate = read_tum(self.scene.groundtruth), self.trajectory()
         results: dict[str, float | None] = {}
-        for alignment, suffix in (("sim3", ""), ("se3", "_se3")):
+        for alignment, suffix in _ALIGNMENTS.items():
             try:
                 error = trajectory_error(estimate, reference, alignment)
             except EvaluationError:
                 # Where no alignment is defined there is no number.
-                results |= {f"ate_m{suffix}": None, f"rotation_deg{suffix}": None}
+                results |= {f"ate_m{suffix}": None}
                 continue
-            results |= {f"ate_m{suffix}": error.ate_m, f"rotation_deg{suffix}": error.rotation_deg}
-            results |= {"ape_full": error.ape_full} if alignment == "se3" else {"scale": error.scale}
+            results |= {f"ate_m{suffix}": error.ate_m, "rotation_deg": error.rotation_deg}
+            if alignment == "sim3":
+                results |= {"scale": error.scale}
+            if alignment == "se3":
+                results |= {"ape_full": error.ape_full}
         return results
 
     def get_average_eval_image_metrics(

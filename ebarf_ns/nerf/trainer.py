@@ -110,6 +110,7 @@ class EbarfTrainer(Trainer):
         self.event_pairs = 0
         self.steps_done = 0
         self.field_restarted = False
+        self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
             super().setup(test_mode)
             if self.progress() >= 1:
@@ -197,7 +198,7 @@ class EbarfTrainer(Trainer):
             "method": self.config.method_name,
             "device": device,
             "threads": torch.get_num_threads(),
-            "seed": self.pipeline.datamanager.config.seed,
+            "seed": self.config.machine.seed,
             "scene": str(scene.folder),
             "scene_digest": _digest((scene.folder / "scene.json").read_bytes() + scene.trajectory.read_bytes()),
             "config_digest": _digest(yaml.dump(asdict(self.config)).encode()),

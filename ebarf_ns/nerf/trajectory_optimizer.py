@@ -10,6 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
+from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
@@ -22,6 +23,8 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     _target: type = field(default_factory=lambda: TrajectoryOptimizer)
     mode: Literal["refine", "off"] = "refine"  # pyright: ignore[reportIncompatibleVariableOverride]
     """Refine every keyframe, or keep the trajectory as it came."""
+    smooth: bool = True
+    """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
     interpolation: Interpolation = "linear"
     """Of positions between keyframes: linear (Eq. 3), or the natural cubic spline of the reference implementation."""
 
@@ -50,6 +53,11 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.keyframe_t_us: Tensor
         self.initial_position: Tensor
         self.initial_quat_wxyz: Tensor
+        start = smoothed(keyframes).poses if config.smooth and config.mode == "refine" else keyframes.poses
+        self.register_buffer("start_position", start.position.clone())
+        self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
+        self.start_position: Tensor
+        self.start_quat_wxyz: Tensor
         if config.mode == "refine":
             self.correction = nn.Parameter(torch.zeros(len(keyframes.t_us), 6))
 
@@ -59,7 +67,8 @@ class TrajectoryOptimizer(CameraOptimizer):
 
     def keyframes(self) -> Poses:
         """The keyframes as corrected so far."""
-        return corrected(self.initial(), self.correction) if self.config.mode == "refine" else self.initial()
+        start = Poses(self.start_position, self.start_quat_wxyz)
+        return corrected(start, self.correction) if self.config.mode == "refine" else start
 
     def trajectory(self) -> Trajectory:
         """The corrected keyframes and their times, detached."""

@@ -19,7 +19,7 @@ class HandheldMotion:
     look_at: tuple[float, float, float] = (1.5, 0.0, -0.1)
     sway_m: tuple[float, float, float] = (0.35, 0.6, 0.3)
     turn_rad: float = 0.18
-    frequency_hz: tuple[float, float] = (0.25, 0.9)
+    frequency_hz: tuple[float, float] = (0.2, 0.7)
     seed: int = 0
     tones: int = 3
 

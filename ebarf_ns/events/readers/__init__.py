@@ -1,0 +1,1 @@
+"""Recordings as cameras and datasets write them, one file per format."""
