@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -147,7 +147,7 @@ class _Object:
     def get(self, key: str) -> Any:
         return self.content.get(key)
 
-    def only(self, keys: list[str]) -> None:
+    def only(self, keys: Sequence[str]) -> None:
         unknown = [key for key in self.content if key not in keys]
         if unknown:
             names = ", ".join(self.name(key) for key in unknown)

@@ -36,10 +36,10 @@ def _read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
         pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise EvaluationError(f"{path}: cannot be read as an image")
-    if pixels.ndim == 3:
-        pixels = pixels[..., :3].mean(axis=-1).astype(pixels.dtype)
-    scale = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0
-    return pixels.astype(np.float64) / scale
+    white = {"uint8": 255.0, "uint16": 65535.0}
+    scale = white.get(pixels.dtype.name, 1.0)
+    grey = pixels[..., :3].mean(axis=-1) if pixels.ndim == 3 else pixels
+    return grey.astype(np.float64) / scale
 
 
 def fit_brightness(
@@ -67,9 +67,9 @@ def image_errors(
     white = max(float(image.max()) for image in reference)
     psnr, ssim = [], []
     for fitted, truth in zip(fit_brightness(rendered_log, reference), reference, strict=True):
-        pair = [torch.from_numpy(np.clip(image / white, 0, 1))[None, None].float() for image in (fitted, truth)]
-        psnr.append(float(peak_signal_noise_ratio(*pair, data_range=1.0)))
-        similarity = structural_similarity_index_measure(*pair, data_range=1.0)
+        ours, theirs = (torch.from_numpy(np.clip(image / white, 0, 1))[None, None].float() for image in (fitted, truth))
+        psnr.append(float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)))
+        similarity = structural_similarity_index_measure(ours, theirs, data_range=1.0)
         assert isinstance(similarity, torch.Tensor)
         ssim.append(float(similarity))
     return {"psnr": float(np.mean(psnr)), "ssim": float(np.mean(ssim))}

@@ -1,17 +1,20 @@
 """How far a trajectory is from a reference, through the evo library."""
 
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 from evo.core import metrics
 from evo.core.geometry import GeometryException
 from evo.core.lie_algebra import se3
 from evo.core.trajectory import PosePath3D
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from ebarf_ns.errors import EvaluationError
 from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.geometry.trajectory_file import read_tum
 
 Alignment = Literal["se3", "sim3", "orientation"]
 
@@ -116,3 +119,39 @@ def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, P
         PosePath3D(estimated_position.copy(), estimated_quat_wxyz.copy()),
         PosePath3D(position, quat_xyzw[:, [3, 0, 1, 2]]),
     )
+
+
+def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.ndarray, "keyframes 3"]:
+    """The estimate's positions aligned by orientation and scale, for plots; as they are where that is not defined."""
+    try:
+        estimated, true = _matched(estimate, reference)
+        turned, straight = (Rotation.from_matrix([p[:3, :3] for p in path.poses_se3]) for path in (estimated, true))
+        _align_by_orientation(estimated, true, (straight * turned.inv()).mean())
+    except EvaluationError:
+        return estimate.poses.position.double().numpy()
+    return np.asarray(estimated.positions_xyz)
+
+
+def compare_files(estimate: Path, reference: Path) -> dict[str, Any]:
+    """The errors of a TUM file against another under every alignment that is defined for them.
+
+    Raises :class:`EvaluationError` where none is.
+    """
+    estimated, true = read_tum(estimate), read_tum(reference)
+    comparison: dict[str, Any] = {}
+    reasons = []
+    for alignment in get_args(Alignment):
+        try:
+            error = trajectory_error(estimated, true, alignment)
+        except EvaluationError as problem:
+            comparison[alignment] = None
+            reasons.append(f"{alignment}: {problem}")
+            continue
+        numbers = vars(error).copy()
+        comparison |= {"matched": numbers.pop("matched")}
+        comparison[alignment] = numbers
+    if not any(comparison.values()):
+        raise EvaluationError(f"{estimate}: {reasons[0]}")
+    notes = [f"{path.name}: seconds, quaternions x y z w, as TUM has them" for path in (estimate, reference)]
+    sim3 = comparison["sim3"]
+    return {**comparison, "scale": sim3 and sim3["scale"], "notes": notes + reasons}

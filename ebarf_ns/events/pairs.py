@@ -32,7 +32,7 @@ class EventPairs:
 
 @dataclass(frozen=True)
 class PairIndex:
-    """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over all such pairs."""
+    """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over such pairs."""
 
     pixel: Int32[np.ndarray, "events"]
     t_us: Int64[np.ndarray, "events"]
@@ -81,12 +81,18 @@ def split_pairs(
     rank = (np.arange(len(order)) - first_of_pixel[pixel]).astype(np.int32)
     columns = (pixel, recording.t_us[order], np.cumsum(recording.polarity[order], dtype=np.int32), rank)
     heldout = heldout[order]
-    kept = tuple(column[~heldout] for column in columns)
-    predecessors = _predecessors(kept[0])
+    kept_pixel, kept_t_us, kept_polarity, kept_rank = (column[~heldout] for column in columns)
+    predecessors = _predecessors(kept_pixel)
     if not (predecessors > 0).any():
         raise RecordingError(f"none of the {len(recording):,} events has another one at its pixel: no pair to train on")
     return (
-        PairIndex(*kept, *_by_predecessors(predecessors, np.arange(len(predecessors)))),
+        PairIndex(
+            kept_pixel,
+            kept_t_us,
+            kept_polarity,
+            kept_rank,
+            *_by_predecessors(predecessors, np.arange(len(predecessors))),
+        ),
         PairIndex(*columns, *_by_predecessors(rank[heldout], np.flatnonzero(heldout))),
     )
 
@@ -118,17 +124,13 @@ def _order_by_pixel(pixel: np.ndarray, pixel_count: int) -> tuple[np.ndarray, np
     return order, first[:-1]
 
 
-def heldout_blocks(
-    t_us: Int64[np.ndarray, "events"], share: float, blocks: int = 20
-) -> Bool[np.ndarray, "events"]:
+def heldout_blocks(t_us: Int64[np.ndarray, "events"], share: float, blocks: int = 20) -> Bool[np.ndarray, "events"]:
     """Mark the events in ``blocks`` evenly spaced windows that together cover ``share`` of the recording's span."""
     phase = (t_us - t_us[0]) / max(int(t_us[-1] - t_us[0]), 1) * blocks % 1
     return np.abs(phase - 0.5) < share / 2
 
 
-def draw_steps(
-    count: int, longest: int, random: np.random.Generator
-) -> Int64[np.ndarray, "pairs"]:
+def draw_steps(count: int, longest: int, random: np.random.Generator) -> Int64[np.ndarray, "pairs"]:
     """Steps between the events of a pair: log-uniform over 1 to ``longest``."""
     return np.exp(random.random(count) * np.log(longest + 1)).astype(np.int64)
 

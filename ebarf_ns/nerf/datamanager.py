@@ -10,8 +10,8 @@ import torch
 import tyro
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
-from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -101,7 +101,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         if self.test_mode == "val":
             recording = self.recording
-            CONSOLE.print(f"{len(recording):,} events, {self.pairs[0].pairs_by_steps[1]:,} consecutive pairs to train on")
+            CONSOLE.print(
+                f"{len(recording):,} events, {self.pairs[0].pairs_by_steps[1]:,} consecutive pairs to train on"
+            )
 
     def setup_eval(self) -> None:
         """The loaders of full views that nerfstudio's scripts ask for."""
@@ -156,8 +158,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         heldout = self.pairs[1]
         if not heldout.max_steps:
             raise RecordingError(
-                f"{self.train_dataset.scene.events}: no pair of events ends in the held-out {self.config.heldout_share:.0%} "
-                "of the recording; expected a larger heldout-share or a longer recording"
+                f"{self.train_dataset.scene.events}: no pair of events ends in the held-out "
+                f"{self.config.heldout_share:.0%} of the recording; expected a larger share or a longer recording"
             )
         random = batch_random(_HELDOUT_SEED, 0)
         steps = draw_steps(self.config.eval_num_rays_per_batch // 2, _LONGEST_HELDOUT_PAIR, random)

@@ -22,6 +22,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from ebarf_ns.errors import TrainingError, one_line_errors
+from ebarf_ns.evaluation.report import write_report
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import write_tum
 from ebarf_ns.nerf.pipeline import EbarfPipeline
@@ -135,6 +136,10 @@ class EbarfTrainer(Trainer):
             write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
             self._record_metrics(self._header())
             super().train()
+
+    def _after_train(self) -> None:
+        write_report(self.base_dir, self.pipeline.scene.groundtruth)
+        super()._after_train()
 
     def train_iteration(self, step: int) -> Any:
         """One step, its share of the budget, and the evaluation that may be due after it."""

@@ -80,7 +80,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         return interpolate(self.keyframe_t_us, self.keyframes(), t_us, self.config.interpolation)
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
-        """Turn event rays, given in the camera's frame at their time, into world rays; others are world rays already."""
+        """Turn event rays, given in the camera's frame at their time, into world rays; others already are."""
         t_us = (raybundle.metadata or {}).pop("event_t_us", None)
         if t_us is not None:
             poses = self.poses_at(t_us[..., 0])
@@ -89,9 +89,11 @@ class TrajectoryOptimizer(CameraOptimizer):
             raybundle.origins = poses.position
 
     def forward(self, indices: Int[Tensor, "cameras"]) -> Float[Tensor, "cameras 3 4"]:
-        """From the refined to the initial camera frame of keyframes, nerfstudio's axes, to be multiplied on the right."""
+        """From refined to initial camera frame of keyframes, in nerfstudio's axes, to be multiplied on the right."""
         flip = torch.tensor([1.0, -1.0, -1.0], device=self.keyframe_t_us.device)
-        initial, refined = (Poses(p.position[indices], p.quat_wxyz[indices]) for p in (self.initial(), self.keyframes()))
+        initial, refined = (
+            Poses(p.position[indices], p.quat_wxyz[indices]) for p in (self.initial(), self.keyframes())
+        )
         to_initial = quat_wxyz_to_matrix(initial.quat_wxyz).mT
         rotation = to_initial @ quat_wxyz_to_matrix(refined.quat_wxyz)
         position = (to_initial @ (refined.position - initial.position)[..., None])[..., 0]

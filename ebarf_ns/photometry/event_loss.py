@@ -11,7 +11,7 @@ def reported_change(
     threshold_on: float,
     threshold_off: float,
 ) -> Float[Tensor, "pairs"]:
-    """Change of log brightness that the events in a pair report: C_on times those brighter - C_off times those darker."""
+    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one."""
     brighter = (event_count + polarity_sum) / 2
     return brighter * threshold_on - (event_count - brighter) * threshold_off
 

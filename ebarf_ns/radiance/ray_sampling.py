@@ -31,9 +31,7 @@ def leave_box(rays: Rays, half_side: float = 1.0) -> Float[Tensor, "rays"]:
     return torch.maximum((half_side - rays.origin) / away, (-half_side - rays.origin) / away).amin(-1)
 
 
-def coarse_edges(
-    near: float, far: Float[Tensor, "rays"], count: int, bounded: bool
-) -> Float[Tensor, "rays count+1"]:
+def coarse_edges(near: float, far: Float[Tensor, "rays"], count: int, bounded: bool) -> Float[Tensor, "rays count+1"]:
     """Interval edges from near to far: even in distance within bounds, else even in its logarithm."""
     u = torch.linspace(0, 1, count + 1, device=far.device, dtype=far.dtype)
     far = far[:, None].clamp_min(2 * near)

@@ -4,7 +4,7 @@ Surfaces are diffuse; their radiance is a smooth, band-limited pattern of positi
 without texture files and has no detail finer than a few centimetres.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -30,21 +30,15 @@ class Room:
     log_contrast: float = 1.1
     """Amplitude of the pattern in log radiance."""
     seed: int = 0
-    _shapes: tuple[np.ndarray, ...] = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        shapes = (
-            np.array([*self.lower, *self.upper]),
-            np.array(self.boxes, float).reshape(-1, 6),
-            np.array(self.balls, float).reshape(-1, 4),
-        )
-        object.__setattr__(self, "_shapes", shapes)
 
     def cast(
         self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "rays 3"]
     ) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
         """Radiance (about 0.05 to 1.5) and distance [m] along unit directions from one point."""
-        return _cast(origin, direction, *self._shapes, self.wavelength, self.log_contrast, self.seed)
+        walls = np.array([*self.lower, *self.upper])
+        boxes = np.array(self.boxes, float).reshape(-1, 6)
+        balls = np.array(self.balls, float).reshape(-1, 4)
+        return _cast(origin, direction, walls, boxes, balls, self.wavelength, self.log_contrast, self.seed)
 
 
 @njit(cache=True, parallel=True)

@@ -40,9 +40,7 @@ def read_text_events(path: Path, width: int, height: int) -> Recording:
                 f"{path}:{line[row]}: {name} is {column[row]}{' us' if name == 't' else ''}, expected {expected} "
                 f"({np.count_nonzero(wrong):,} such lines)"
             )
-    return Recording(
-        x.astype(np.uint16), y.astype(np.uint16), np.ascontiguousarray(t_us), (2 * p - 1).astype(np.int8)
-    )
+    return Recording(x.astype(np.uint16), y.astype(np.uint16), np.ascontiguousarray(t_us), (2 * p - 1).astype(np.int8))
 
 
 def _line_blocks(content: bytes):

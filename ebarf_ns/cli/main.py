@@ -1,0 +1,194 @@
+"""The ``ebarf`` command: arguments in, one call, a message out."""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from ebarf_ns.errors import EbarfError, one_line_errors
+from ebarf_ns.process import Bounds
+from ebarf_ns.simulation.simulate import Simulation
+
+
+@dataclass
+class Simulate:
+    """Simulate an event camera moved by hand through a textured room: a scene folder with the truth beside it."""
+
+    output: tyro.conf.Positional[Path]
+    """The scene folder to make."""
+    settings: tyro.conf.OmitArgPrefixes[Simulation] = field(default_factory=Simulation)
+    """What to simulate."""
+
+    def run(self) -> None:
+        """Simulate with a progress bar."""
+        from ebarf_ns.simulation.simulate import simulate
+
+        _refuse_existing(self.output)
+        with Progress(transient=True, console=_stderr) as progress:
+            task = progress.add_task("simulating", total=1.0)
+            simulate(self.settings, self.output, lambda fraction: progress.update(task, completed=fraction))
+        _stderr.print(f"simulated scene in {self.output}; look at it with: ebarf inspect {self.output}")
+
+
+@dataclass
+class Process:
+    """Make a scene folder of a recording; ecd is the event camera dataset's text layout (Mueggler et al. 2017)."""
+
+    format: tyro.conf.Positional[Literal["ecd"]]
+    source: tyro.conf.Positional[Path]
+    """The recording's folder, which is only read."""
+    output: Path
+    """The scene folder to make."""
+    trajectory: Path | None = None
+    """Initial keyframe poses as a TUM file; groundtruth.txt where not given."""
+    sensor_size: tuple[int, int] = (240, 180)
+    """Columns and rows; the DAVIS240C of the dataset."""
+    bounds: Bounds | None = None
+    """Lower and upper corner of the scene in world units, where known."""
+
+    def run(self) -> None:
+        """Make the scene and say what is in it."""
+        from ebarf_ns.process import process_ecd
+
+        _refuse_existing(self.output)
+        _stderr.print(process_ecd(self.source, self.output, self.trajectory, self.sensor_size, self.bounds))
+
+
+@dataclass
+class Inspect:
+    """What is in a scene folder, and what looks wrong in it."""
+
+    scene: tyro.conf.Positional[Path]
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Print the summary."""
+        from ebarf_ns.inspection import inspect_scene, print_summary, summary_json
+
+        summary = inspect_scene(self.scene)
+        if self.json:
+            _print_json(summary_json(summary))
+        else:
+            print_summary(summary, self.scene)
+
+
+@dataclass
+class TrajectoryCompare:
+    """Errors of a trajectory against a reference, both TUM files."""
+
+    estimate: tyro.conf.Positional[Path]
+    reference: tyro.conf.Positional[Path]
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Print the errors under each alignment."""
+        from ebarf_ns.evaluation.trajectory_error import compare_files
+
+        comparison = compare_files(self.estimate, self.reference)
+        if self.json:
+            _print_json(comparison)
+        else:
+            Console().print_json(data=comparison)
+
+
+@dataclass
+class TrajectoryPerturb:
+    """Add white noise to every pose of a TUM file, in its own frame: an imperfect trajectory for experiments."""
+
+    source: tyro.conf.Positional[Path]
+    output: tyro.conf.Positional[Path]
+    position: float = 0.03
+    """Standard deviation per axis, in the trajectory's unit."""
+    rotation_deg: float = 1.72
+    """Standard deviation per axis."""
+    seed: int = 0
+
+    def run(self) -> None:
+        """Write the perturbed trajectory."""
+        from math import radians
+
+        from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
+        from ebarf_ns.simulation.motion import perturb
+
+        perturbed = perturb(read_tum(self.source), self.position, radians(self.rotation_deg), self.seed)
+        write_tum(self.output, perturbed)
+        _stderr.print(f"{len(perturbed.t_us)} perturbed poses in {self.output}")
+
+
+@dataclass
+class Evaluate:
+    """A finished run's numbers from its folder, and its report made anew."""
+
+    run_folder: tyro.conf.Positional[Path]
+    """The folder with config.yml and metrics.jsonl."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Print the last evaluation and where the report is."""
+        from ebarf_ns.evaluation.report import read_metrics, write_report
+        from ebarf_ns.scene import read_scene
+
+        header, evaluations = read_metrics(self.run_folder)
+        try:
+            groundtruth = read_scene(Path(header["scene"])).groundtruth
+        except EbarfError:
+            # A run outlives its scene: its numbers are its own.
+            groundtruth = None
+        page = write_report(self.run_folder, groundtruth)
+        if self.json:
+            _print_json({**evaluations[-1], "method": header.get("method"), "report": str(page)})
+        else:
+            Console().print_json(data=evaluations[-1])
+            _stderr.print(f"report: {page}")
+
+
+@dataclass
+class Trajectory:
+    """Tools for trajectories in TUM format."""
+
+    command: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[TrajectoryCompare, tyro.conf.subcommand("compare")]
+        | Annotated[TrajectoryPerturb, tyro.conf.subcommand("perturb")]
+    ]
+
+    def run(self) -> None:
+        """Run the chosen tool."""
+        self.command.run()
+
+
+_stderr = Console(stderr=True)
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(content) + "\n")
+
+
+def _refuse_existing(output: Path) -> None:
+    from ebarf_ns.errors import SceneError
+
+    if output.exists() and not (output / "scene.json").is_file() and (not output.is_dir() or any(output.iterdir())):
+        raise SceneError(f"{output}: exists and is not a scene folder, expected a new folder or a scene to replace")
+
+
+def entrypoint() -> None:
+    """The console script."""
+    with one_line_errors():
+        command = tyro.extras.subcommand_cli_from_dict(
+            {
+                "simulate": Simulate,
+                "process": Process,
+                "inspect": Inspect,
+                "trajectory": Trajectory,
+                "evaluate": Evaluate,
+            },
+            description=__doc__,
+        )
+        command.run()

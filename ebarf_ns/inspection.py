@@ -1,0 +1,177 @@
+"""What is in a scene folder, and what looks wrong in it."""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.scene import Scene, read_scene
+
+_HOT_RATIO = 50
+_FEW_EVENTS_PER_PIXEL = 5
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Numbers of a scene; ``suspicions`` are sentences for a person."""
+
+    events: int
+    width: int
+    height: int
+    start_us: int
+    end_us: int
+    events_per_second: float
+    brighter_share: float
+    silent_pixel_share: float
+    events_per_active_pixel: float
+    busiest_pixel: tuple[int, int, int]
+    """Column, row, events."""
+    keyframes: int
+    trajectory_start_us: int
+    trajectory_end_us: int
+    keyframes_per_second: float
+    path_length: float
+    events_within_trajectory: int
+    contrast_threshold: tuple[float, float] | None
+    bounded: bool
+    frames: int
+    groundtruth: bool
+    suspicions: list[str] = field(default_factory=list)
+
+
+def inspect_scene(folder: Path) -> Summary:
+    """Read the whole scene; raises the reader's error for anything that training would stumble over."""
+    scene = read_scene(folder)
+    recording = read_recording(scene.events, scene.camera.width, scene.camera.height)
+    trajectory = read_tum(scene.trajectory)
+    if scene.groundtruth:
+        read_tum(scene.groundtruth)
+    summary = _summarize(scene, recording, trajectory)
+    summary.suspicions.extend(_suspicions(scene, summary, trajectory))
+    return summary
+
+
+def _summarize(scene: Scene, recording: Recording, trajectory: Trajectory) -> Summary:
+    camera = scene.camera
+    counts = np.bincount(
+        recording.y.astype(np.int64) * camera.width + recording.x, minlength=camera.width * camera.height
+    )
+    busiest = int(counts.argmax())
+    start_us, end_us = int(recording.t_us[0]), int(recording.t_us[-1])
+    first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    return Summary(
+        events=len(recording),
+        width=camera.width,
+        height=camera.height,
+        start_us=start_us,
+        end_us=end_us,
+        events_per_second=len(recording) / max((end_us - start_us) * 1e-6, 1e-6),
+        brighter_share=float((recording.polarity > 0).mean()),
+        silent_pixel_share=float((counts == 0).mean()),
+        events_per_active_pixel=float(counts[counts > 0].mean()),
+        busiest_pixel=(busiest % camera.width, busiest // camera.width, int(counts[busiest])),
+        keyframes=len(trajectory.t_us),
+        trajectory_start_us=first_us,
+        trajectory_end_us=last_us,
+        keyframes_per_second=(len(trajectory.t_us) - 1) / ((last_us - first_us) * 1e-6),
+        path_length=float(trajectory.poses.position.diff(dim=0).norm(dim=-1).sum()),
+        events_within_trajectory=len(recording.between(first_us, last_us)),
+        contrast_threshold=(scene.contrast_threshold.on, scene.contrast_threshold.off)
+        if scene.contrast_threshold
+        else None,
+        bounded=scene.bounds is not None,
+        frames=len(scene.frames),
+        groundtruth=scene.groundtruth is not None,
+    )
+
+
+def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[str]:
+    found = []
+    outside = summary.events - summary.events_within_trajectory
+    if not summary.events_within_trajectory:
+        found.append(
+            "no event lies within the trajectory's span: are both on the same clock, the trajectory in seconds?"
+        )
+    elif outside > 0.05 * summary.events:
+        found.append(f"{outside / summary.events:.0%} of the events lie outside the trajectory's span and are left out")
+    if not 0.35 < summary.brighter_share < 0.65:
+        found.append(
+            f"{summary.brighter_share:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?"
+        )
+    column, row, count = summary.busiest_pixel
+    if count > _HOT_RATIO * summary.events_per_active_pixel:
+        ratio = count / summary.events_per_active_pixel
+        found.append(f"pixel ({column}, {row}) has {count:,} events, {ratio:.0f} times the mean: hot?")
+    if summary.events_per_active_pixel < _FEW_EVENTS_PER_PIXEL:
+        found.append(
+            f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"
+        )
+    if summary.path_length == 0:
+        found.append("the trajectory does not move: depth cannot be seen without translation")
+    gaps_us = trajectory.t_us.diff()
+    if int(gaps_us.max()) > 5 * float(gaps_us.double().median()):
+        found.append(f"the longest gap between keyframes is {int(gaps_us.max()) / 1000:.0f} ms, 5 times the median")
+    if scene.bounds is None:
+        found.append(
+            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail"
+        )
+    return found
+
+
+def print_summary(summary: Summary, folder: Path) -> None:
+    """For a person."""
+    console = Console()
+    table = Table(title=str(folder), show_header=False, title_justify="left")
+    for name, value in _lines(summary):
+        table.add_row(name, value)
+    console.print(table)
+    for suspicion in summary.suspicions:
+        console.print(f"[yellow]![/yellow] {suspicion}")
+    if not summary.suspicions:
+        console.print("[green]nothing suspicious[/green]")
+
+
+def _lines(summary: Summary) -> list[tuple[str, str]]:
+    column, row, count = summary.busiest_pixel
+    seconds = (summary.end_us - summary.start_us) * 1e-6
+    threshold = summary.contrast_threshold
+    within = summary.events_within_trajectory / summary.events
+    return [
+        ("sensor", f"{summary.width} x {summary.height}"),
+        ("events", f"{summary.events:,} over {seconds:.3f} s, {summary.events_per_second:,.0f} a second"),
+        ("time", f"{summary.start_us:,} to {summary.end_us:,} us"),
+        ("polarity", f"{summary.brighter_share:.1%} brighter, {1 - summary.brighter_share:.1%} darker"),
+        (
+            "pixels",
+            f"{summary.silent_pixel_share:.1%} silent, the others {summary.events_per_active_pixel:.1f} events each; "
+            f"busiest ({column}, {row}) with {count:,}",
+        ),
+        (
+            "trajectory",
+            f"{summary.keyframes} keyframes, {summary.keyframes_per_second:.1f} a second, "
+            f"{summary.trajectory_start_us:,} to {summary.trajectory_end_us:,} us, path {summary.path_length:.3f} long",
+        ),
+        ("events within it", f"{summary.events_within_trajectory:,} ({within:.1%})"),
+        (
+            "thresholds",
+            f"on {threshold[0]}, off {threshold[1]}: threshold loss (Eq. 5)"
+            if threshold
+            else "unknown: normalised loss (Eq. 6)",
+        ),
+        ("bounds", "given" if summary.bounded else "none: unbounded"),
+        (
+            "references",
+            f"{summary.frames} validation frames, {'ground truth' if summary.groundtruth else 'no ground truth'}",
+        ),
+    ]
+
+
+def summary_json(summary: Summary) -> dict[str, Any]:
+    """For a program."""
+    return asdict(summary)
