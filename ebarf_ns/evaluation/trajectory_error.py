@@ -78,7 +78,8 @@ def _align_by_orientation(estimated: PosePath3D, true: PosePath3D, world: Rotati
     """Rotate, scale and shift ``estimated`` in place; returns the scale."""
     moved = world.apply(estimated.positions_xyz)
     offset, goal = moved - moved.mean(axis=0), true.positions_xyz - true.positions_xyz.mean(axis=0)
-    if not (offset**2).sum() > 0 or not (goal**2).sum() > 0:
+    still = 1e-12 * max(float(np.abs(moved).max()), float(np.abs(true.positions_xyz).max()), 1e-300)
+    if np.abs(offset).max() <= still or np.abs(goal).max() <= still:
         raise EvaluationError("the trajectory or its reference does not move, expected motion to align")
     scale = float((offset * goal).sum() / (offset**2).sum())
     if scale <= 0:

@@ -13,6 +13,7 @@ from ebarf_ns.files import whole_file
 
 # Also the longest recording that gets a ms_to_idx table: about 6 days.
 _MAX_SPAN_US = 1 << 39
+_MAX_TIME_US = 1 << 61
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,10 @@ def read_recording(path: Path, width: int, height: int) -> Recording:
     _check(
         path, "y", columns["y"], (columns["y"] < 0) | (columns["y"] >= height), f"0 to {height - 1}, the sensor height"
     )
-    _check(path, "p", columns["p"], columns["p"] > 1, "0 (darker) or 1 (brighter)")
-    t_us = columns["t"].astype(np.int64)
+    _check(path, "p", columns["p"], (columns["p"] < 0) | (columns["p"] > 1), "0 (darker) or 1 (brighter)")
+    t = columns["t"]
+    _check(path, "t", t, (t > _MAX_TIME_US) | (t < -_MAX_TIME_US), f"microseconds within ±{_MAX_TIME_US}")
+    t_us = t.astype(np.int64)
     _check(path, "t", columns["t"], np.r_[False, t_us[1:] < t_us[:-1]], "a time not before that of the event above it")
     return Recording(
         columns["x"].astype(np.uint16),

@@ -35,10 +35,7 @@ class Camera:
 
     def bearings(self, pixel: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
         """Unit viewing directions of pixels, in the camera's OpenCV frame, float64."""
-        pixel = pixel.double()
-        centre = torch.tensor([self.cx, self.cy], dtype=torch.float64)
-        focal = torch.tensor([self.fx, self.fy], dtype=torch.float64)
-        distorted = (pixel - centre) / focal
+        distorted = (pixel.double() - self._centre) / self._focal
         if self.model == "equidistant":
             return _equidistant_bearings(distorted, self.distortion)
         plane = _undistort_radtan(distorted, self.distortion) if self.model == "radtan" else distorted
@@ -53,7 +50,15 @@ class Camera:
         if self.model == "equidistant":
             radius = plane.norm(dim=-1, keepdim=True).clamp_min(1e-12)
             plane = plane / radius * _equidistant_radius(radius.atan(), self.distortion)
-        return plane * torch.tensor([self.fx, self.fy]).double() + torch.tensor([self.cx, self.cy]).double()
+        return plane * self._focal + self._centre
+
+    @property
+    def _focal(self) -> Float[Tensor, "2"]:
+        return torch.tensor([self.fx, self.fy], dtype=torch.float64)
+
+    @property
+    def _centre(self) -> Float[Tensor, "2"]:
+        return torch.tensor([self.cx, self.cy], dtype=torch.float64)
 
 
 def _distort_radtan(plane: Tensor, coefficients: tuple[float, ...]) -> Tensor:

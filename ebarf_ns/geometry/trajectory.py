@@ -99,13 +99,11 @@ def _natural_spline_curvature(
     keyframe_t_us: Int64[Tensor, "keyframes"], position: Float[Tensor, "keyframes 3"]
 ) -> Float[Tensor, "keyframes 3"]:
     """Second derivatives of the natural cubic spline at its knots, per second squared (zero at both ends)."""
-    count = len(keyframe_t_us)
-    if count == 2:
-        return torch.zeros_like(position)
     interval_s = (keyframe_t_us[1:] - keyframe_t_us[:-1]).double() * 1e-6
     slope = (position[1:] - position[:-1]).double() / interval_s[:, None]
-    curvature: Tensor = _SolveTridiagonal.apply(interval_s, 6 * (slope[1:] - slope[:-1]))  # pyright: ignore[reportAssignmentType]
-    return torch.nn.functional.pad(curvature, (0, 0, 1, 1)).to(position.dtype)
+    bend = torch.nn.functional.pad(6 * (slope[1:] - slope[:-1]), (0, 0, 1, 1))
+    curvature: Tensor = _SolveTridiagonal.apply(interval_s, bend)  # pyright: ignore[reportAssignmentType]
+    return curvature.to(position.dtype)
 
 
 class _SolveTridiagonal(torch.autograd.Function):
@@ -122,8 +120,10 @@ class _SolveTridiagonal(torch.autograd.Function):
 
 
 def _solve_spline_system(interval_s: Tensor, right: Tensor) -> Tensor:
-    upper_bands = torch.zeros(2, len(interval_s) - 1, dtype=torch.float64)
-    upper_bands[0, 1:] = interval_s[1:-1]
-    upper_bands[1] = 2 * (interval_s[1:] + interval_s[:-1])
+    # First and last row say that the curvature is zero there.
+    upper_bands = torch.zeros(2, len(interval_s) + 1, dtype=torch.float64)
+    upper_bands[0, 2:-1] = interval_s[1:-1]
+    upper_bands[1] = 1.0
+    upper_bands[1, 1:-1] = 2 * (interval_s[1:] + interval_s[:-1])
     solution = solveh_banded(upper_bands.numpy(), right.detach().cpu().numpy())
     return torch.from_numpy(solution).to(right)

@@ -53,10 +53,9 @@ def resample(
     count: int,
     jitter: Float[Tensor, "rays 1"],
 ) -> Float[Tensor, "rays count+1"]:
-    """Edges of ``count`` new intervals, as dense as the weights are heavy; ``jitter`` in [0, 1) shifts them all."""
+    """Edges of ``count`` new intervals, as dense as the weights are heavy; ``jitter`` in [-0.5, 0.5) shifts them all."""
     cumulative = torch.nn.functional.pad((weights / weights.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
-    inner = (torch.arange(count - 1, device=edges.device) + jitter + 0.5 * (1 - 1 / count)) / count
-    inner = inner.clamp(0, 1).contiguous()
+    inner = ((torch.arange(1, count, device=edges.device) + jitter) / count).contiguous()
     upper = torch.searchsorted(cumulative, inner, right=True).clamp(1, edges.shape[-1] - 1)
     c0, c1 = cumulative.gather(-1, upper - 1), cumulative.gather(-1, upper)
     e0, e1 = edges.gather(-1, upper - 1), edges.gather(-1, upper)

@@ -1,0 +1,78 @@
+"""Scenes and runs that tests share: made once a session, by the commands that users type."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parent.parent
+DATA = Path(os.environ.get("EBARF_TEST_DATA", REPOSITORY.parent / "shared" / "data"))
+TINY_TRAINING = [
+    "--max-num-iterations=80",
+    "--evaluations=2",
+    "--pipeline.datamanager.train-num-rays-per-batch=512",
+    "--pipeline.model.samples=24",
+    "--pipeline.model.grid-table-size-log2=12",
+    "--pipeline.model.grid-finest=64",
+    "--pipeline.model.density-cells=32",
+]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a command left behind."""
+
+    code: int
+    output: str
+    errors: str
+
+
+def run_command(*words: object, timeout_s: float = 300, cwd: Path | None = None) -> Finished:
+    """Run a console script of this environment, as a user would."""
+    name, *arguments = map(str, words)
+    script = Path(sys.executable).parent / name
+    environment = {**os.environ, "COLUMNS": "200", "PATH": f"{script.parent}{os.pathsep}{os.environ['PATH']}"}
+    finished = subprocess.run(
+        [script, *arguments], capture_output=True, text=True, timeout=timeout_s, cwd=cwd, env=environment, check=False
+    )
+    return Finished(finished.returncode, finished.stdout, finished.stderr)
+
+
+def run_ok(*words: object, timeout_s: float = 300, cwd: Path | None = None) -> str:
+    """Run a command that must succeed, and return its standard output."""
+    finished = run_command(*words, timeout_s=timeout_s, cwd=cwd)
+    assert finished.code == 0, f"{words}\n{finished.output[-3000:]}\n{finished.errors[-3000:]}"
+    return finished.output
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a second of a simulated room at 48x36."""
+    folder = tmp_path_factory.mktemp("scenes") / "tiny"
+    run_ok(
+        "ebarf", "simulate", folder, "--width=48", "--height=36", "--focal-px=41", "--duration-s=0.5", "--frames=3"
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained_run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short ebarf training of the tiny scene, through ns-train."""
+    output = tmp_path_factory.mktemp("runs")
+    run_ok(
+        "ns-train", "ebarf", "--data", tiny_scene, "--output-dir", output, "--experiment-name=tiny", "--timestamp=run",
+        "--vis=tensorboard", *TINY_TRAINING,
+    )  # fmt: skip
+    return output / "tiny" / "ebarf" / "run"
+
+
+@pytest.fixture
+def slider_depth() -> Path:
+    """The first events of slider_depth, where the recordings are at hand."""
+    folder = DATA / "slider_depth"
+    if not folder.is_dir():
+        pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")
+    return folder

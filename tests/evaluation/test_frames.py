@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ebarf_ns.errors import EvaluationError
+from ebarf_ns.evaluation.frames import fit_brightness, image_errors, read_frame
+from ebarf_ns.geometry.cameras import Camera
+from ebarf_ns.scene import Frame
+
+CAMERA = Camera("pinhole", 32, 24, 30, 30, 15.5, 11.5)
+
+
+def frame(path: Path, intensity: str = "linear") -> Frame:
+    return Frame(path, 0, CAMERA, (), intensity)  # pyright: ignore[reportArgumentType]
+
+
+def picture(seed: int = 0) -> np.ndarray:
+    smooth = cv2.GaussianBlur(np.random.default_rng(seed).random((24, 32)), (0, 0), 2)
+    return 0.05 + 0.9 * (smooth - smooth.min()) / np.ptp(smooth)
+
+
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint8, 255), (np.uint16, 65535)])
+def test_png_of_either_depth_is_read_as_zero_to_one(tmp_path: Path, dtype: type, white: int):
+    cv2.imwrite(str(tmp_path / "a.png"), (picture() * white).round().astype(dtype))
+    assert np.allclose(read_frame(frame(tmp_path / "a.png")), picture(), atol=1 / white)
+
+
+def test_intensity_says_how_to_get_to_linear(tmp_path: Path):
+    np.save(tmp_path / "log.npy", np.log(picture()).astype(np.float32))
+    assert np.allclose(read_frame(frame(tmp_path / "log.npy", "log")), picture(), rtol=1e-5)
+    srgb = np.where(picture() <= 0.0031308, 12.92 * picture(), 1.055 * picture() ** (1 / 2.4) - 0.055)
+    np.save(tmp_path / "srgb.npy", srgb)
+    assert np.allclose(read_frame(frame(tmp_path / "srgb.npy", "srgb")), picture(), rtol=1e-6)
+
+
+def test_wrong_size_or_no_image_is_named(tmp_path: Path):
+    np.save(tmp_path / "small.npy", np.zeros((3, 4)))
+    with pytest.raises(EvaluationError, match=r"4x3 pixels, expected the camera's 32x24"):
+        read_frame(frame(tmp_path / "small.npy"))
+    (tmp_path / "a.png").write_text("no image")
+    with pytest.raises(EvaluationError, match="cannot be read"):
+        read_frame(frame(tmp_path / "a.png"))
+
+
+def test_gain_and_offset_of_log_brightness_are_no_error():
+    references = [picture(0), picture(1)]
+    renders = [1.7 * np.log(image) - 3 for image in references]
+    assert image_errors(renders, references)["psnr"] > 80
+    noisy = [render + 0.1 * np.random.default_rng(0).standard_normal(render.shape) for render in renders]
+    errors = image_errors(noisy, references)
+    again = image_errors([0.3 * image + 9 for image in noisy], references)
+    assert 15 < errors["psnr"] < 40 and again["psnr"] == pytest.approx(errors["psnr"], abs=1e-4)
+
+
+def test_one_fit_for_the_whole_set():
+    references = [picture(0), picture(1)]
+    renders = [np.log(references[0]), np.log(references[1]) + 2]
+    assert image_errors(renders, references)["psnr"] < 30
+
+
+def test_a_constant_grey_render_scores_badly_and_finitely():
+    errors = image_errors([np.full((24, 32), 0.3)], [picture()])
+    assert 5 < errors["psnr"] < 20 and errors["ssim"] < 0.5
+    assert np.isfinite(fit_brightness([np.zeros((24, 32))], [np.zeros((24, 32))])[0]).all()

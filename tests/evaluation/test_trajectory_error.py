@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ebarf_ns.errors import EvaluationError
+from ebarf_ns.evaluation.trajectory_error import aligned_positions, compare_files, trajectory_error
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory_file import write_tum
+
+
+def make(position: np.ndarray, turn: Rotation, start_us: int = 0) -> Trajectory:
+    t_us = torch.arange(len(position)) * 10_000 + start_us
+    return Trajectory(t_us, Poses(torch.from_numpy(position), torch.from_numpy(turn.as_quat()[:, [3, 0, 1, 2]])))
+
+
+def wander(count: int = 20, seed: int = 0) -> tuple[np.ndarray, Rotation]:
+    random = np.random.default_rng(seed)
+    return random.standard_normal((count, 3)), Rotation.random(count, random_state=seed)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 100), st.floats(0.1, 10))
+def test_a_similarity_is_no_error(seed: int, scale: float):
+    position, turn = wander(seed=seed)
+    world = Rotation.random(random_state=seed + 1)
+    moved = make(scale * world.apply(position) + [1, -2, 3], world * turn)
+    error = trajectory_error(moved, make(position, turn), "sim3")
+    assert error.ate_m < 1e-9 and error.rotation_deg < 1e-5 and error.scale == pytest.approx(1 / scale)
+    assert trajectory_error(moved, make(position, turn), "orientation").ate_m < 1e-8
+
+
+def test_se3_keeps_the_scale():
+    position, turn = wander()
+    position -= position.mean(axis=0)
+    error = trajectory_error(make(1.1 * position, turn), make(position, turn), "se3")
+    assert error.scale == 1 and error.ate_m == pytest.approx(0.1 * np.sqrt((position**2).sum(1).mean()), rel=1e-6)
+
+
+def test_error_does_not_change_when_the_estimate_is_moved():
+    position, turn = wander()
+    random = np.random.default_rng(5)
+    noisy_position = position + 0.05 * random.standard_normal(position.shape)
+    noisy_turn = turn * Rotation.from_rotvec(0.02 * random.standard_normal(position.shape))
+    world = Rotation.random(random_state=9)
+    here = trajectory_error(make(noisy_position, noisy_turn), make(position, turn), "sim3")
+    there = trajectory_error(
+        make(3 * world.apply(noisy_position) + 7, world * noisy_turn), make(position, turn), "sim3"
+    )
+    assert there.ate_m == pytest.approx(here.ate_m, rel=1e-9)
+    assert there.rotation_deg == pytest.approx(here.rotation_deg, rel=1e-6)
+    assert np.degrees(0.02 * np.sqrt(3)) == pytest.approx(here.rotation_deg, rel=0.3)
+
+
+def test_another_body_on_the_rig_is_no_rotation_error():
+    position, turn = wander()
+    error = trajectory_error(
+        make(position, turn * Rotation.from_euler("y", 30, degrees=True)), make(position, turn), "se3"
+    )
+    assert error.rotation_deg > 5 and error.rotation_deg_body < 1e-4
+
+
+def test_reference_is_interpolated_and_poses_outside_left_out():
+    position, turn = np.linspace([0, 0, 0], [1, 2, 3], 20), Rotation.identity(20)
+    position[:, 1] **= 2
+    error = trajectory_error(make(position, turn, start_us=100_000), make(position, turn), "se3")
+    assert error.matched == 10
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3"])
+@pytest.mark.parametrize("shape", ["line", "point", "two"])
+def test_no_alignment_is_no_number(alignment: str, shape: str):
+    position, turn = wander(2 if shape == "two" else 10)
+    if shape == "line":
+        position = np.linspace(0, 1, 10)[:, None] * [[1.0, 2, 3]]
+    if shape == "point":
+        position = np.ones((10, 3))
+    with pytest.raises(EvaluationError):
+        trajectory_error(make(position, turn), make(position, turn), alignment)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_line_can_be_aligned_by_orientation():
+    position, turn = np.linspace(0, 1, 10)[:, None] * [[1.0, 2, 3]], wander(10)[1]
+    world = Rotation.random(random_state=3)
+    moved = make(2 * world.apply(position) + 5, world * turn)
+    assert trajectory_error(moved, make(position, turn), "orientation").ate_m < 1e-8
+    assert np.allclose(aligned_positions(moved, make(position, turn)), position, atol=1e-8)
+    with pytest.raises(EvaluationError, match="does not move"):
+        trajectory_error(make(np.ones((10, 3)), turn), make(position, turn), "orientation")
+
+
+def test_files_are_compared_with_every_alignment(tmp_path):
+    position, turn = wander()
+    for name in ("a.txt", "b.txt"):
+        write_tum(tmp_path / name, make(position, turn))
+    comparison = compare_files(tmp_path / "a.txt", tmp_path / "b.txt")
+    assert comparison["matched"] == 20 and comparison["sim3"]["ate_m"] < 1e-6 and len(comparison["notes"]) == 2

@@ -1,0 +1,105 @@
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.recording import Recording, read_recording, write_recording
+
+WIDTH, HEIGHT = 24, 18
+GOOD = {"x": [0, 23, 5], "y": [0, 17, 5], "t": [10, 10, 2500], "p": [0, 1, 1]}
+
+
+def write(path: Path, t_offset: int | None = None, **columns: object) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, column in {**GOOD, **columns}.items():
+            if column is not None:
+                file[f"events/{name}"] = np.asarray(column)
+        if t_offset is not None:
+            file["t_offset"] = np.int64(t_offset)
+    return path
+
+
+def test_reads_columns_with_offset(tmp_path: Path):
+    recording = read_recording(write(tmp_path / "e.h5", t_offset=1_700_000_000_000_000), WIDTH, HEIGHT)
+    assert recording.t_us.tolist() == [1_700_000_000_000_010, 1_700_000_000_000_010, 1_700_000_000_002_500]
+    assert recording.polarity.tolist() == [-1, 1, 1]
+    assert recording.x.dtype == np.uint16 and recording.t_us.dtype == np.int64
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 23), st.integers(0, 17), st.integers(0, 5000), st.booleans()), min_size=1),
+    st.integers(-(10**15), 10**15),
+)
+def test_written_recording_reads_back_equal(tmp_path_factory: pytest.TempPathFactory, events: list, start_us: int):
+    x, y, t, p = (np.array(column) for column in zip(*events, strict=True))
+    recording = Recording(
+        x.astype(np.uint16), y.astype(np.uint16), np.sort(t).astype(np.int64) + start_us, np.where(p, 1, -1).astype(np.int8)
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("h5") / "e.h5"
+    write_recording(path, recording)
+    back = read_recording(path, WIDTH, HEIGHT)
+    for column in ("x", "y", "t_us", "polarity"):
+        assert np.array_equal(getattr(back, column), getattr(recording, column))
+    with h5py.File(path) as file:
+        times, index = np.asarray(file["events/t"]), np.asarray(file["ms_to_idx"])
+        for millisecond, first in enumerate(index):
+            assert (times[first:] >= millisecond * 1000).all() and (times[:first] < millisecond * 1000).all()
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"x": [0, 24, 5]}, "/events/x row 1 is 24, expected 0 to 23"),
+        ({"y": [0, 18, 5]}, "/events/y row 1 is 18, expected 0 to 17"),
+        ({"y": [-1, 0, 5]}, "/events/y row 0 is -1"),
+        ({"p": [0, 1, 2]}, "/events/p row 2 is 2, expected 0 (darker) or 1 (brighter)"),
+        ({"p": np.array([-1, 1, 1], np.int8)}, "/events/p row 0 is -1, expected 0"),
+        ({"t": [10, 9, 2500]}, "/events/t row 1 is 9, expected a time not before"),
+        ({"t": np.array([1, 2, 1 << 63], np.uint64)}, "/events/t row 2 is 9223372036854775808, expected microseconds"),
+        ({"t": [10, 20]}, "columns of /events differ in length"),
+        ({"t": [0.1, 0.2, float("nan")]}, "/events/t holds float64, expected integers"),
+        ({"x": None}, "dataset /events/x is missing"),
+        ({"x": [[1, 2, 3]]}, "dataset /events/x is missing, expected one column"),
+        ({"x": [], "y": [], "t": [], "p": []}, "holds float64"),
+        ({name: np.zeros(0, np.int64) for name in "xytp"}, "/events is empty"),
+    ],
+)
+def test_wrong_columns_are_named_with_row_and_value(tmp_path: Path, columns: dict, words: str):
+    path = write(tmp_path / "e.h5", **columns)
+    with pytest.raises(RecordingError) as caught:
+        read_recording(path, WIDTH, HEIGHT)
+    assert str(caught.value).startswith(str(path)) and words in str(caught.value)
+
+
+def test_swapped_columns_do_not_fit_the_sensor(tmp_path: Path):
+    with pytest.raises(RecordingError, match="sensor height"):
+        read_recording(write(tmp_path / "e.h5", x=[3, 17, 5], y=[3, 23, 5]), WIDTH, HEIGHT)
+
+
+def test_cut_file_is_an_error_at_every_length(tmp_path: Path):
+    whole = write(tmp_path / "e.h5").read_bytes()
+    expected = read_recording(tmp_path / "e.h5", WIDTH, HEIGHT)
+    cut = tmp_path / "cut.h5"
+    for length in range(0, len(whole), 61):
+        cut.write_bytes(whole[:length])
+        try:
+            read = read_recording(cut, WIDTH, HEIGHT)
+        except RecordingError as error:
+            assert str(cut) in str(error)
+        else:
+            assert np.array_equal(read.t_us, expected.t_us)
+
+
+def test_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(RecordingError, match="no such file"):
+        read_recording(tmp_path / "gone.h5", WIDTH, HEIGHT)
+
+
+def test_between_includes_both_ends(tmp_path: Path):
+    recording = read_recording(write(tmp_path / "e.h5"), WIDTH, HEIGHT)
+    assert len(recording.between(10, 10)) == 2 and len(recording.between(11, 2500)) == 1
+    assert len(recording.between(11, 12)) == 0

@@ -1,0 +1,184 @@
+"""Training through the trainer itself, in this process: budget, resume, guard, schedules, and what is left behind."""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.nerf import method
+from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig
+
+
+def config(scene: Path, output: Path, name: str = "ebarf", steps: int = 12) -> EbarfTrainerConfig:
+    specification = {"ebarf": method.ebarf, "ebarf-paper": method.ebarf_paper, "enerf": method.enerf}[name]
+    made = copy.deepcopy(specification.config)
+    assert isinstance(made, EbarfTrainerConfig)
+    made.data = made.pipeline.datamanager.data = scene
+    made.output_dir, made.experiment_name, made.timestamp = output, "x", "run"
+    made.vis = "tensorboard"
+    made.viewer.quit_on_train_completion = True
+    made.logging.local_writer.enable = False
+    made.max_num_iterations, made.evaluations, made.machine.device_type = steps, 2, "cpu"
+    model = made.pipeline.model
+    model.grid_table_size_log2, model.samples, model.density_cells = 10, 8, 16  # pyright: ignore[reportAttributeAccessIssue]
+    model.grid_levels, model.grid_finest = 4, 32  # pyright: ignore[reportAttributeAccessIssue]
+    datamanager = made.pipeline.datamanager
+    datamanager.train_num_rays_per_batch, datamanager.eval_num_rays_per_batch = 128, 512  # pyright: ignore[reportAttributeAccessIssue]
+    return made
+
+
+def trainer(made: EbarfTrainerConfig) -> EbarfTrainer:
+    torch.manual_seed(made.machine.seed)
+    ready = made.setup(local_rank=0, world_size=1)
+    ready.setup()
+    return ready
+
+
+def state(ready: EbarfTrainer) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in ready.pipeline.state_dict().items()}
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("name", ["ebarf", "ebarf-paper", "enerf"])
+def test_each_method_leaves_trajectories_metrics_and_report(tiny_scene: Path, tmp_path: Path, name: str):
+    made = config(tiny_scene, tmp_path, name)
+    trainer(made).train()
+    run = tmp_path / "x" / name / "run"
+    header, *evaluations = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert header["method"] == name and len(evaluations) == 2
+    last = evaluations[-1]
+    assert last["step"] == 12 and last["event_pairs"] == 12 * 64 and last["skipped_steps"] == 0
+    assert 0 < last["heldout_event_loss"] <= 1.001 and last["psnr"] > 5 and last["ate_m"] > 0
+    initial, refined = (read_tum(run / f"trajectory_{which}.txt") for which in ("initial", "refined"))
+    given = read_tum(tiny_scene / "trajectory.txt")
+    assert torch.equal(initial.t_us, given.t_us)
+    assert torch.allclose(initial.poses.position, given.poses.position, atol=1e-5)
+    moved = (refined.poses.position - initial.poses.position).abs().max()
+    assert moved < 1e-5 if name == "enerf" else moved > 1e-4
+    assert (run / "report" / "report.html").stat().st_size > 10_000
+
+
+def test_seconds_end_a_run_and_drive_its_schedules(tiny_scene: Path, tmp_path: Path):
+    made = config(tiny_scene, tmp_path, steps=10**6)
+    made.max_train_seconds = 1.5
+    ready = trainer(made)
+    ready.train()
+    assert ready.train_seconds >= 1.5 and ready.steps_done < 10**5
+    assert ready.progress() >= 1 and ready.field_restarted
+    rate = ready.optimizers.optimizers["fields"].param_groups[0]["lr"]
+    assert rate < 0.3 * made.optimizers["fields"]["optimizer"].lr
+
+
+def test_equal_seeds_give_equal_runs_and_others_do_not(tiny_scene: Path, tmp_path: Path):
+    ends = []
+    for seed in (1, 1, 2):
+        made = config(tiny_scene, tmp_path / str(len(ends)))
+        made.machine.seed = seed
+        ready = trainer(made)
+        ready.train()
+        ends.append(state(ready))
+    assert same(ends[0], ends[1]) and not same(ends[0], ends[2])
+
+
+def test_a_resumed_run_ends_bitwise_where_an_uninterrupted_one_does(tiny_scene: Path, tmp_path: Path):
+    whole = trainer(config(tiny_scene, tmp_path / "whole"))
+    whole.train()
+    first = trainer(config(tiny_scene, tmp_path / "first"))
+    for step in range(7):
+        first.pipeline.train()
+        first.train_iteration(step)
+    first.save_checkpoint(6)
+    made = config(tiny_scene, tmp_path / "second")
+    made.load_dir = first.checkpoint_dir
+    second = trainer(made)
+    assert second.steps_done == 7 and second.field_restarted
+    second.train()
+    assert same(state(whole), state(second))
+
+
+def test_a_used_up_budget_is_said_in_one_line(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    done = trainer(config(tiny_scene, tmp_path))
+    done.train()
+    made = config(tiny_scene, tmp_path / "again")
+    made.load_dir = done.checkpoint_dir
+    with pytest.raises(SystemExit) as stopped:
+        trainer(made)
+    assert stopped.value.code == 2 and "expected a larger --max-num-iterations" in capsys.readouterr().err
+
+
+def test_a_step_with_a_broken_gradient_changes_nothing(tiny_scene: Path, tmp_path: Path):
+    ready = trainer(config(tiny_scene, tmp_path))
+    ready.pipeline.train()
+    ready.train_iteration(0)
+    before = state(ready)
+    handle = ready.pipeline.model.camera_optimizer.correction.register_hook(lambda gradient: gradient * float("nan"))
+    grid = {name for name in before if "density_grid" in name or "display_range" in name}
+    ready.train_iteration(1)
+    after = state(ready)
+    assert all(torch.equal(before[name], after[name]) for name in before if name not in grid)
+    assert ready.optimizers.skipped == 1  # pyright: ignore[reportAttributeAccessIssue]
+    handle.remove()
+    ready.train_iteration(2)
+    assert not same(after, state(ready))
+
+
+def test_ten_broken_steps_in_a_row_end_the_run(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    ready = trainer(config(tiny_scene, tmp_path, steps=50))
+    ready.pipeline.model.camera_optimizer.correction.register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(SystemExit) as stopped:
+        ready.train()
+    assert stopped.value.code == 2 and "10 training steps in a row" in capsys.readouterr().err
+
+
+def test_the_newest_checkpoint_replaces_the_older_and_loads_without_pickled_code(tiny_scene: Path, tmp_path: Path):
+    ready = trainer(config(tiny_scene, tmp_path))
+    ready.train()
+    (path,) = ready.checkpoint_dir.iterdir()
+    assert torch.load(path, weights_only=True)["step"] == 11
+    assert not list(ready.base_dir.glob("*.ckpt"))
+
+
+def test_pairs_share_distances_and_jitter(tiny_scene: Path, tmp_path: Path):
+    ready = trainer(config(tiny_scene, tmp_path))
+    model = ready.pipeline.model.train()
+    model.begin_step(0, seed=0)
+    bundle, _ = ready.pipeline.datamanager.next_train(0)
+    model.camera_optimizer.apply_to_raybundle(bundle)
+    from ebarf_ns.radiance.ray_sampling import Rays
+
+    before, after = model.sample_edges(Rays(bundle.origins, bundle.directions)).chunk(2)
+    assert torch.equal(before, after)
+
+
+MODEL_CHANGES = {
+    "loss": "normalized", "brightness": "lin_log", "intensity_range": "unit", "view_dependent": True, "grid_levels": 5,
+    "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
+    "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3, "density_bias": 1.0,
+}  # fmt: skip
+DATA_CHANGES = {"train_num_rays_per_batch": 64, "longest_pair": 3, "heldout_share": 0.2, "seed": 5}
+
+
+@pytest.mark.parametrize("key", [*MODEL_CHANGES, *DATA_CHANGES, "smooth", "interpolation", "mode"])
+def test_every_field_of_the_configuration_changes_the_run(tiny_scene: Path, tmp_path: Path, key: str):
+    losses = []
+    for change in (False, True):
+        made = config(tiny_scene, tmp_path, steps=3)
+        if change and key in MODEL_CHANGES:
+            setattr(made.pipeline.model, key, MODEL_CHANGES[key])
+        if change and key in DATA_CHANGES:
+            setattr(made.machine if key == "seed" else made.pipeline.datamanager, key, DATA_CHANGES[key])
+        if change and key in ("smooth", "interpolation", "mode"):
+            value = {"smooth": False, "interpolation": "cubic", "mode": "off"}[key]
+            setattr(made.pipeline.model.camera_optimizer, key, value)  # pyright: ignore[reportAttributeAccessIssue]
+        torch.manual_seed(0)
+        ready = made.setup(local_rank=0, world_size=1)
+        ready.setup()
+        ready.pipeline.train()
+        losses.append([float(ready.train_iteration(step)[0].detach()) for step in range(3)])
+    assert losses[0] != losses[1], f"{key} changed nothing"

@@ -1,0 +1,58 @@
+import pytest
+import torch
+
+from ebarf_ns.radiance.field import RadianceField, contract
+from ebarf_ns.radiance.hash_grid import HashGridShape
+
+SHAPE = HashGridShape(levels=4, features=2, coarsest=4, finest=32, table_size_log2=10)
+
+
+def test_contraction_keeps_the_inside_and_squeezes_the_rest():
+    inside = torch.rand(100, 3) * 2 - 1
+    assert torch.equal(contract(inside), inside)
+    far = contract(torch.tensor([[1e9, 0, 0], [0, -3.0, 1.5]]))
+    assert far.abs().max() <= 2 and torch.allclose(far[0], torch.tensor([2.0, 0, 0]))
+    point = torch.tensor([[0.0, 0, 0], [1, 1, 1], [50, 2, 3]], requires_grad=True)
+    (gradient,) = torch.autograd.grad(contract(point).sum(), point)
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+@pytest.mark.parametrize("view_dependent", [True, False])
+@pytest.mark.parametrize("intensity_range", ["unit", "positive"])
+def test_density_and_intensity_are_what_they_must_be(bounded: bool, view_dependent: bool, intensity_range: str):
+    torch.manual_seed(0)
+    field = RadianceField(SHAPE, bounded, view_dependent, intensity_range)  # pyright: ignore[reportArgumentType]
+    torch.nn.init.normal_(field.grid.table)
+    point = (torch.rand(20_000, 3) * 4 - 2).requires_grad_()
+    direction = torch.nn.functional.normalize(torch.randn(20_000, 3), dim=-1)
+    density, intensity = field(point, direction if view_dependent else None)
+    assert density.shape == intensity.shape == (20_000,)
+    assert (density > 0).all() and (intensity > 0).all()
+    assert intensity_range == "positive" or (intensity < 1).all()
+    (gradient,) = torch.autograd.grad(density.sum() + intensity.sum(), point)
+    assert torch.isfinite(gradient).all() and gradient.abs().sum() > 0
+    turned, _ = field(point, -direction if view_dependent else None)
+    assert torch.equal(turned, density)
+
+
+def test_view_dependence_changes_intensity_alone():
+    torch.manual_seed(0)
+    field = RadianceField(SHAPE, bounded=True, view_dependent=True)
+    point = torch.rand(10, 3)
+    axes = torch.eye(3)
+    assert not torch.equal(field(point, axes[:1].expand(10, 3))[1], field(point, axes[1:2].expand(10, 3))[1])
+
+
+def test_reset_forgets():
+    torch.manual_seed(0)
+    field = RadianceField(SHAPE, bounded=True)
+    before = [parameter.detach().clone() for parameter in field.parameters()]
+    field.reset()
+    assert all(not torch.equal(old, new) for old, new in zip(before, field.parameters(), strict=True))
+
+
+def test_huge_raw_density_stays_finite():
+    field = RadianceField(SHAPE, bounded=True, density_bias=500.0)
+    density, _ = field(torch.rand(10, 3), None)
+    assert torch.isfinite(density).all()

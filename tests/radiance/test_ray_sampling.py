@@ -1,0 +1,123 @@
+import math
+
+import pytest
+import torch
+
+from ebarf_ns.radiance.field import RadianceField
+from ebarf_ns.radiance.hash_grid import HashGridShape
+from ebarf_ns.radiance.ray_sampling import (
+    DensityGrid,
+    Rays,
+    coarse_edges,
+    composite,
+    leave_box,
+    resample,
+    weights_of,
+)
+
+
+class Slab(torch.nn.Module):
+    """A dense wall from x = 0.5 on; intensity 0.7."""
+
+    view_dependent = False
+
+    def forward(self, point: torch.Tensor, direction: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.where(point[:, 0] > 0.5, 1e4, 0.0), torch.full_like(point[:, 0], 0.7)
+
+    def density_in_unit_cube(self, unit: torch.Tensor) -> torch.Tensor:
+        return torch.where(unit[:, 0] > 0.75, 100.0, 0.0)
+
+
+def along_x(count: int = 1) -> Rays:
+    return Rays(torch.zeros(count, 3), torch.tensor([[1.0, 0, 0]]).expand(count, 3))
+
+
+def test_rays_leave_the_box_where_they_should():
+    direction = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [1, 1, 0], [0, 0, -1]]), dim=-1)
+    far = leave_box(Rays(torch.tensor([[0.5, 0, 0], [0, 0, 0], [0, 0, 0.25]]), direction))
+    assert torch.allclose(far, torch.tensor([0.5, math.sqrt(2), 1.25]))
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_coarse_edges_grow_from_near_to_far(bounded: bool):
+    edges = coarse_edges(0.1, torch.tensor([2.0, 100.0, 0.0]), 32, bounded)
+    assert torch.allclose(edges[:, 0], torch.tensor(0.1)) and (edges.diff(dim=-1) > 0).all()
+    assert torch.allclose(edges[:2, -1], torch.tensor([2.0, 100.0]))
+
+
+def test_weights_are_those_of_the_quadrature():
+    density, edges = torch.rand(4, 9) * 5, torch.cat([torch.zeros(4, 1), torch.rand(4, 9).cumsum(-1)], dim=-1)
+    alpha = 1 - torch.exp(-density * edges.diff(dim=-1))
+    transmitted = torch.cat([torch.ones(4, 1), (1 - alpha).cumprod(-1)], dim=-1)
+    assert torch.allclose(weights_of(density, edges), alpha * transmitted[:, :-1], atol=1e-6)
+    assert torch.allclose(weights_of(density, edges).sum(-1), 1 - transmitted[:, -1], atol=1e-6)
+
+
+def test_weights_of_nothing_and_of_a_wall_are_finite():
+    edges = torch.linspace(0, 1, 9)[None]
+    for density in (0.0, 1e12):
+        raw = torch.full((1, 8), density, requires_grad=True)
+        weights = weights_of(raw, edges)
+        (gradient,) = torch.autograd.grad(weights.sum(), raw)
+        assert torch.isfinite(weights).all() and torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("jitter", [-0.5, 0.0, 0.499])
+def test_resampled_edges_are_ordered_span_everything_and_follow_the_weights(jitter: float):
+    edges = torch.linspace(0, 1, 11)[None]
+    weights = torch.full((1, 10), 0.01)
+    weights[0, 6] = 1.0
+    fine = resample(edges, weights, 40, torch.tensor([[jitter]]))
+    assert fine.shape == (1, 41) and (fine.diff(dim=-1) >= 0).all()
+    assert fine[0, 0] == 0 and fine[0, -1] == 1
+    inside = ((fine > 0.6) & (fine < 0.7)).float().mean()
+    assert inside > 0.8
+
+
+def test_even_weights_give_even_samples_whose_jitter_averages_to_nothing():
+    edges = torch.linspace(2, 4, 9)[None]
+    jitters = torch.linspace(-0.5, 0.5, 101)[:-1, None]
+    fine = resample(edges.expand(100, 9), torch.ones(100, 8), 16, jitters)
+    expected = torch.linspace(2, 4, 17)[1:-1]
+    assert torch.allclose(fine.mean(0)[1:-1], expected, atol=2e-3)
+
+
+def test_a_wall_is_seen_at_its_depth():
+    edges = torch.linspace(0.0, 1.0, 201)[None]
+    rendered = composite(Slab(), along_x(), edges, background=0.0)  # pyright: ignore[reportArgumentType]
+    assert float(rendered.depth) == pytest.approx(0.5, abs=0.01)
+    assert float(rendered.intensity) == pytest.approx(0.7, abs=1e-4)
+    assert float(rendered.accumulation) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_empty_space_shows_the_background_at_the_far_end():
+    edges = torch.linspace(0.0, 0.4, 11)[None]
+    rendered = composite(Slab(), along_x(), edges, background=0.25)  # pyright: ignore[reportArgumentType]
+    assert float(rendered.intensity) == pytest.approx(0.25) and float(rendered.depth) == pytest.approx(0.4)
+
+
+def test_density_grid_remembers_where_the_wall_is():
+    grid = DensityGrid(16, bounded=True)
+    generator = torch.Generator().manual_seed(0)
+    for k in range(3 * grid.refresh_share):
+        grid.refresh(Slab(), k, generator)  # pyright: ignore[reportArgumentType]
+    seen = grid.lookup(torch.tensor([[0.9, 0.1, -0.3], [-0.2, 0.5, 0.5]]))
+    assert seen[0] > 10 and seen[1] < 1
+    grid.reset()
+    assert (grid.density == 1).all()
+
+
+def test_density_grid_of_an_unbounded_scene_reaches_everywhere():
+    grid = DensityGrid(16, bounded=False)
+    assert torch.isfinite(grid.lookup(torch.tensor([[1e9, -1e9, 3.0], [0, 0, 0]]))).all()
+
+
+def test_gradient_moves_the_ray_towards_the_light():
+    torch.manual_seed(0)
+    field = RadianceField(HashGridShape(4, 2, 4, 32, 10), bounded=True)
+    torch.nn.init.normal_(field.grid.table)
+    origin = torch.zeros(2, 3, requires_grad=True)
+    rays = Rays(origin, torch.nn.functional.normalize(torch.ones(2, 3), dim=-1))
+    rendered = composite(field, rays, coarse_edges(0.05, leave_box(rays), 16, True), 0.5)
+    (gradient,) = torch.autograd.grad(rendered.intensity.sum(), origin)
+    assert torch.isfinite(gradient).all() and gradient.abs().sum() > 0

@@ -1,0 +1,120 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ebarf_ns.errors import SceneError
+from ebarf_ns.scene import read_scene, write_scene
+
+CAMERA = {"model": "radtan", "width": 24, "height": 18, "fx": 30.0, "fy": 31.0, "cx": 11.5, "cy": 8.5,
+          "distortion": [-0.1, 0.05, 0.0, 0.001]}  # fmt: skip
+SCENE = {
+    "format": "ebarf-scene", "version": 1, "events": "events.h5", "trajectory": "trajectory.txt", "groundtruth": None,
+    "frames": "frames.json", "camera": CAMERA, "contrast_threshold": {"on": 0.2, "off": 0.3},
+    "bounds": [[-1, -1, -1], [1, 1, 2]],
+}  # fmt: skip
+FRAME = {"file": "a.png", "t_us": 17, "intensity": "srgb"}
+
+
+def make(folder: Path, scene: object = SCENE, frames: object = (FRAME,)) -> Path:
+    for name in ("events.h5", "trajectory.txt", "a.png"):
+        (folder / name).touch()
+    (folder / "scene.json").write_text(json.dumps(scene))
+    (folder / "frames.json").write_text(json.dumps(frames))
+    return folder
+
+
+def test_reads_what_the_format_says(tmp_path: Path):
+    scene = read_scene(make(tmp_path))
+    assert scene.camera.distortion == (-0.1, 0.05, 0.0, 0.001)
+    assert scene.contrast_threshold is not None and scene.contrast_threshold.off == 0.3
+    assert scene.bounds == ((-1, -1, -1), (1, 1, 2))
+    assert scene.frames[0].camera == scene.camera and scene.frames[0].intensity == "srgb"
+    assert scene.groundtruth is None
+
+
+def test_optional_keys_may_be_missing(tmp_path: Path):
+    needed = {key: SCENE[key] for key in ("format", "version", "events", "trajectory", "camera")}
+    scene = read_scene(make(tmp_path, needed))
+    assert scene.bounds is None and scene.contrast_threshold is None and scene.frames == ()
+
+
+def test_written_scene_reads_back_equal(tmp_path: Path):
+    scene = read_scene(make(tmp_path))
+    moved = replace(scene.frames[0], event_camera_from_frame_camera=((1, 0, 0, 2), (0, 1, 0, 0), (0, 0, 1, 0),
+                                                                    (0, 0, 0, 1)))  # fmt: skip
+    scene = replace(scene, frames=(moved, replace(moved, camera=replace(scene.camera, fx=99.0))))
+    write_scene(scene)
+    assert read_scene(tmp_path) == scene
+
+
+def changed(**changes: object) -> dict:
+    return {**SCENE, **changes}
+
+
+def camera(**changes: object) -> dict:
+    return changed(camera={**CAMERA, **changes})
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        (changed(format="other"), "format is 'other', expected 'ebarf-scene'"),
+        (changed(version=2), "version is 2, expected 1"),
+        (changed(evnets="x"), "unknown key evnets"),
+        (changed(events="gone.h5"), "events names 'gone.h5', but there is no file"),
+        (changed(events=3), "events is 3, expected a file name"),
+        (changed(groundtruth="gone.txt"), "groundtruth names 'gone.txt'"),
+        (changed(camera=None), "camera is None, expected a JSON object"),
+        (camera(model="fisheye"), "camera.model is 'fisheye', expected one of pinhole, radtan, equidistant"),
+        (camera(width=0), "camera.width is 0, expected an integer above 0"),
+        (camera(width=24.5), "camera.width is 24.5, expected an integer"),
+        (camera(fx=-1), "camera.fx is -1, expected a finite number above 0"),
+        (camera(cx=float("nan")), "camera.cx is nan, expected a finite number"),
+        (camera(cy="8"), "camera.cy is '8', expected a finite number"),
+        (camera(distortion=[1, 2]), "camera.distortion is [1, 2], expected a list of 4 or 5 numbers"),
+        (camera(k1=0.1), "unknown key camera.k1"),
+        (changed(contrast_threshold={"on": 0.2}), "contrast_threshold.off is missing, expected a finite number above 0"),
+        (changed(contrast_threshold={"on": 0, "off": 1}), "contrast_threshold.on is 0"),
+        (changed(bounds=[[0, 0, 0], [1, 1, 0]]), "bounds is"),
+        (changed(bounds=[[0, 0], [1, 1]]), "bounds is"),
+        (changed(bounds=7), "bounds is 7, expected two corners"),
+        ([], "the file is [], expected a JSON object"),
+    ],
+)  # fmt: skip
+def test_wrong_scene_names_file_key_value_and_expectation(tmp_path: Path, scene: object, words: str):
+    with pytest.raises(SceneError) as caught:
+        read_scene(make(tmp_path, scene))
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path / "scene.json")) and words in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        ({**FRAME, "file": "gone.png"}, "[0].file names 'gone.png'"),
+        ({**FRAME, "t_us": 1.5}, "[0].t_us is 1.5, expected an integer"),
+        ({**FRAME, "intensity": "gamma"}, "[0].intensity is 'gamma', expected one of linear, srgb, log"),
+        ({**FRAME, "event_camera_from_frame_camera": [[1, 0], [0, 1]]}, "expected a 4x4 matrix"),
+        ({**FRAME, "exposure": 1}, "unknown key [0].exposure"),
+        (5, "[0] is 5, expected a JSON object"),
+    ],
+)
+def test_wrong_frame_is_named(tmp_path: Path, frame: object, words: str):
+    with pytest.raises(SceneError, match="frames.json") as caught:
+        read_scene(make(tmp_path, frames=[frame]))
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe{}", b"[" * 100_000])
+def test_broken_json_is_named(tmp_path: Path, content: bytes):
+    make(tmp_path)
+    (tmp_path / "scene.json").write_bytes(content)
+    with pytest.raises(SceneError, match="scene.json"):
+        read_scene(tmp_path)
+
+
+def test_missing_folder_is_named(tmp_path: Path):
+    with pytest.raises(SceneError, match="no such folder"):
+        read_scene(tmp_path / "gone")
