@@ -75,7 +75,7 @@ def camera(**changes: object) -> dict:
         (camera(cy="8"), "camera.cy is '8', expected a finite number"),
         (camera(distortion=[1, 2]), "camera.distortion is [1, 2], expected a list of 4 or 5 numbers"),
         (camera(k1=0.1), "unknown key camera.k1"),
-        (changed(contrast_threshold={"on": 0.2}), "contrast_threshold.off is missing, expected a finite number above 0"),
+        (changed(contrast_threshold={"on": 0.2}), "contrast_threshold.off is missing, expected a finite number above"),
         (changed(contrast_threshold={"on": 0, "off": 1}), "contrast_threshold.on is 0"),
         (changed(bounds=[[0, 0, 0], [1, 1, 0]]), "bounds is"),
         (changed(bounds=[[0, 0], [1, 1]]), "bounds is"),

@@ -16,7 +16,7 @@ def _trainer(
     datamanager: EventDataManagerConfig,
     model: EbarfModelConfig,
     field_rate: float,
-    pose_rate: float,
+    pose_rate_px: float,
     restart_field_at: float | None = None,
 ) -> EbarfTrainerConfig:
     return EbarfTrainerConfig(
@@ -37,7 +37,7 @@ def _trainer(
                 "scheduler": BudgetDecayConfig(),
             },
             "camera_opt": {
-                "optimizer": FusedAdamConfig(lr=pose_rate, betas=(0.9, 0.99)),
+                "optimizer": FusedAdamConfig(lr=pose_rate_px, betas=(0.9, 0.99)),
                 "scheduler": BudgetDecayConfig(),
             },
         },
@@ -69,7 +69,7 @@ ebarf = MethodSpecification(
         EventDataManagerConfig(),
         EbarfModelConfig(),
         field_rate=1e-2,
-        pose_rate=1e-3,
+        pose_rate_px=0.1,
         restart_field_at=0.3,
     ),
     description="NeRF from an event camera and its imperfect trajectory, which is refined on the way.",
@@ -81,7 +81,7 @@ ebarf_paper = MethodSpecification(
         EventDataManagerConfig(longest_pair=1),
         _paper_model("refine"),
         field_rate=5e-3,
-        pose_rate=1e-3,
+        pose_rate_px=0.1,
     ),
     description="E-BARF as published: consecutive event pairs, uniform samples, normalised loss.",
 )
@@ -92,7 +92,7 @@ enerf = MethodSpecification(
         EventDataManagerConfig(longest_pair=1),
         _paper_model("off"),
         field_rate=5e-3,
-        pose_rate=1e-3,
+        pose_rate_px=0.1,
     ),
     description="E-NeRF: ebarf-paper with the poses frozen.",
 )

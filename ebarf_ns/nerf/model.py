@@ -27,7 +27,8 @@ from ebarf_ns.radiance.ray_sampling import (
 )
 from ebarf_ns.scene import Scene
 
-_FAR_UNBOUNDED = 1e3
+# Without bounds, 400 times the trajectory's radius; beyond it contracted space is a hundredth of a cell thick.
+_FAR_UNBOUNDED = 100.0
 _BACKGROUND = 0.5
 
 
@@ -99,6 +100,7 @@ class EbarfModel(Model):
             num_cameras=self.num_train_data,
             device="cpu",
             keyframes=self.kwargs["metadata"]["keyframes"],
+            focal_px=scene.camera.fx,
         )
         self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
         self.display_range: Tensor

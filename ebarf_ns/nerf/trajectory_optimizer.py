@@ -30,9 +30,11 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
 
 
 class TrajectoryOptimizer(CameraOptimizer):
-    """Keyframe poses with a zero-initialised correction (rotation [rad], translation) each, in the camera's frame.
+    """Keyframe poses with a zero-initialised correction (rotation, translation) each, in the camera's frame.
 
-    Called ``camera_optimizer`` in the model, so that nerfstudio's viewer and exporters show the refined poses.
+    Corrections are counted in pixels: one is the rotation, or the translation at unit distance, that moves the image
+    by a pixel, so that one learning rate suits cameras of any focal length. The model holds this module under the
+    name ``camera_optimizer``, by which nerfstudio's viewer and exporters find the refined poses.
     """
 
     config: TrajectoryOptimizerConfig
@@ -43,10 +45,12 @@ class TrajectoryOptimizer(CameraOptimizer):
         num_cameras: int,
         device: torch.device | str,
         keyframes: Trajectory,
+        focal_px: float,
         **kwargs: Any,
     ):
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
+        self.pixel_rad = 1 / focal_px
         self.register_buffer("keyframe_t_us", keyframes.t_us.clone())
         self.register_buffer("initial_position", keyframes.poses.position.clone())
         self.register_buffer("initial_quat_wxyz", keyframes.poses.quat_wxyz.clone())
@@ -68,7 +72,7 @@ class TrajectoryOptimizer(CameraOptimizer):
     def keyframes(self) -> Poses:
         """The keyframes as corrected so far."""
         start = Poses(self.start_position, self.start_quat_wxyz)
-        return corrected(start, self.correction) if self.config.mode == "refine" else start
+        return corrected(start, self.pixel_rad * self.correction) if self.config.mode == "refine" else start
 
     def trajectory(self) -> Trajectory:
         """The corrected keyframes and their times, detached."""
@@ -118,10 +122,10 @@ class TrajectoryOptimizer(CameraOptimizer):
         """No penalty: the gauge is free while training."""
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
-        """Mean size of the corrections."""
+        """Mean size of the corrections, in pixels."""
         if self.config.mode == "refine":
-            metrics_dict["correction_rotation_rad"] = self.correction[:, :3].detach().norm(dim=-1).mean()
-            metrics_dict["correction_translation"] = self.correction[:, 3:].detach().norm(dim=-1).mean()
+            metrics_dict["correction_rotation_px"] = self.correction[:, :3].detach().norm(dim=-1).mean()
+            metrics_dict["correction_translation_px"] = self.correction[:, 3:].detach().norm(dim=-1).mean()
 
     def get_param_groups(self, param_groups: dict) -> None:
         """The corrections, under nerfstudio's name for camera parameters."""

@@ -53,7 +53,7 @@ def resample(
     count: int,
     jitter: Float[Tensor, "rays 1"],
 ) -> Float[Tensor, "rays count+1"]:
-    """Edges of ``count`` new intervals, as dense as the weights are heavy; ``jitter`` in [-0.5, 0.5) shifts them all."""
+    """Edges of ``count`` intervals, as dense as the weights are heavy; ``jitter`` in [-0.5, 0.5) shifts them all."""
     cumulative = torch.nn.functional.pad((weights / weights.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
     inner = ((torch.arange(1, count, device=edges.device) + jitter) / count).contiguous()
     upper = torch.searchsorted(cumulative, inner, right=True).clamp(1, edges.shape[-1] - 1)

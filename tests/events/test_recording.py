@@ -36,9 +36,8 @@ def test_reads_columns_with_offset(tmp_path: Path):
 )
 def test_written_recording_reads_back_equal(tmp_path_factory: pytest.TempPathFactory, events: list, start_us: int):
     x, y, t, p = (np.array(column) for column in zip(*events, strict=True))
-    recording = Recording(
-        x.astype(np.uint16), y.astype(np.uint16), np.sort(t).astype(np.int64) + start_us, np.where(p, 1, -1).astype(np.int8)
-    )  # fmt: skip
+    t_us = np.sort(t).astype(np.int64) + start_us
+    recording = Recording(x.astype(np.uint16), y.astype(np.uint16), t_us, np.where(p, 1, -1).astype(np.int8))
     path = tmp_path_factory.mktemp("h5") / "e.h5"
     write_recording(path, recording)
     back = read_recording(path, WIDTH, HEIGHT)

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -12,14 +13,14 @@ COUNT = 6
 
 
 def keyframes() -> Trajectory:
-    quat = torch.from_numpy(Rotation.random(COUNT, random_state=0).as_quat()).float()[:, [3, 0, 1, 2]]
+    quat = torch.from_numpy(Rotation.random(COUNT, rng=np.random.default_rng(0)).as_quat()).float()[:, [3, 0, 1, 2]]
     position = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
     return Trajectory(torch.arange(COUNT) * 50_000, Poses(position, quat))
 
 
 def optimizer(moved: bool = True, **options: object) -> TrajectoryOptimizer:
     config = TrajectoryOptimizerConfig(smooth=False, **options)  # pyright: ignore[reportArgumentType]
-    made: TrajectoryOptimizer = config.setup(num_cameras=COUNT, device="cpu", keyframes=keyframes())
+    made: TrajectoryOptimizer = config.setup(num_cameras=COUNT, device="cpu", keyframes=keyframes(), focal_px=1.0)
     if moved and config.mode == "refine":
         torch.nn.init.normal_(made.correction, std=0.1)
     return made
@@ -106,6 +107,6 @@ def test_interpolation_changes_positions_between_keyframes_alone():
 
 def test_smoothing_moves_the_start_and_keeps_what_came():
     config = TrajectoryOptimizerConfig(smooth=True)
-    made: TrajectoryOptimizer = config.setup(num_cameras=COUNT, device="cpu", keyframes=keyframes())
+    made: TrajectoryOptimizer = config.setup(num_cameras=COUNT, device="cpu", keyframes=keyframes(), focal_px=1.0)
     assert torch.equal(made.initial().position, keyframes().poses.position)
     assert not torch.equal(made.keyframes().position, keyframes().poses.position)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,5 +82,5 @@ def test_the_room_is_closed_and_solid():
 @pytest.mark.parametrize("setting", ["duration_s", "threshold_on", "focal_px", "keyframe_rate_hz"])
 def test_impossible_settings_are_named_and_leave_nothing(tmp_path: Path, setting: str):
     with pytest.raises(SimulationError, match=setting):
-        simulate(Simulation(**{setting: 0.0}), tmp_path / "scene")
+        simulate(replace(Simulation(), **{setting: 0.0}), tmp_path / "scene")
     assert not list(tmp_path.iterdir())

@@ -1,0 +1,100 @@
+"""A bad scene ends ns-train and ebarf inspect in one line that names file, place, value and expectation."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import run_command
+
+
+def edit_json(**changes: object) -> Callable[[Path], None]:
+    def edit(scene: Path) -> None:
+        content = json.loads((scene / "scene.json").read_text())
+        (scene / "scene.json").write_text(json.dumps({**content, **changes}))
+
+    return edit
+
+
+def edit_column(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    def edit(scene: Path) -> None:
+        with h5py.File(scene / "events.h5", "r+") as file:
+            column = change(np.asarray(file[f"events/{name}"]))
+            del file[f"events/{name}"]
+            file[f"events/{name}"] = column
+
+    return edit
+
+
+def edit_trajectory(change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
+    def edit(scene: Path) -> None:
+        lines = [line for line in (scene / "trajectory.txt").read_text().splitlines() if not line.startswith("#")]
+        (scene / "trajectory.txt").write_text("\n".join(change(lines)) + "\n")
+
+    return edit
+
+
+def at(row: int, value: int) -> Callable[[np.ndarray], np.ndarray]:
+    def change(column: np.ndarray) -> np.ndarray:
+        column[row] = value
+        return column
+
+    return change
+
+
+def scaled_times(factor: float) -> Callable[[list[str]], list[str]]:
+    def change(lines: list[str]) -> list[str]:
+        return [f"{float(line.split()[0]) * factor:.6f} {line.split(maxsplit=1)[1]}" for line in lines]
+
+    return change
+
+
+CASES = {
+    "no events file": (lambda scene: (scene / "events.h5").unlink(), "events names 'events.h5'"),
+    "wrong key": (edit_json(evnets=1), "unknown key evnets"),
+    "unsorted": (edit_column("t", lambda t: t[::-1]), "/events/t row 1 is"),
+    "ragged": (edit_column("x", lambda x: x[:-1]), "differ in length"),
+    "outside the sensor": (edit_column("x", at(7, 48)), "/events/x row 7 is 48, expected 0 to 47"),
+    "polarity": (edit_column("p", at(3, 2)), "/events/p row 3 is 2, expected 0 (darker) or 1 (brighter)"),
+    "not HDF5": (lambda scene: (scene / "events.h5").write_text("x y t p"), "not a readable HDF5 file"),
+    "one keyframe": (edit_trajectory(lambda lines: lines[:1]), "at least 2 keyframes, got 1"),
+    "duplicate keyframe": (edit_trajectory(lambda lines: [*lines[:3], *lines[2:]]), "trajectory.txt:4: timestamp"),
+    "decreasing keyframes": (edit_trajectory(lambda lines: lines[::-1]), "keyframe times must increase"),
+    "zero quaternion": (edit_trajectory(lambda lines: ["0 0 0 0 0 0 0 0", *lines[1:]]), "has length 0, expected 1"),
+    "not a number": (edit_trajectory(lambda lines: ["0 nan 0 0 0 0 0 1", *lines[1:]]), "tx is nan, expected a finite"),
+    "bounds elsewhere": (edit_json(bounds=[[90, 90, 90], [91, 91, 91]]), "hold none of the 11 keyframes"),
+}
+ONLY_TRAINING = {
+    "another clock": (edit_trajectory(lambda lines: [f"7{line}" for line in lines]), "none of the"),
+    "milliseconds": (edit_trajectory(scaled_times(1e6)), "expected the same clock and, in the trajectory, seconds"),
+}
+
+
+@pytest.fixture
+def scene(tiny_scene: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(tiny_scene, tmp_path / "scene")
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case != "bounds elsewhere"])
+def test_inspect_says_what_is_wrong(scene: Path, case: str):
+    spoil, words = CASES[case]
+    spoil(scene)
+    finished = run_command("ebarf", "inspect", scene)
+    assert finished.code == 2 and finished.output == "" and words in finished.errors
+    assert finished.errors.startswith("error: ") and finished.errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("case", ["wrong key", "unsorted", "one keyframe", "bounds elsewhere", *ONLY_TRAINING])
+def test_train_says_what_is_wrong_and_leaves_no_half_run(scene: Path, tmp_path: Path, case: str):
+    spoil, words = {**CASES, **ONLY_TRAINING}[case]
+    spoil(scene)
+    finished = run_command(
+        "ns-train", "ebarf", "--data", scene, "--output-dir", tmp_path / "out", "--vis=tensorboard", "--timestamp=run"
+    )
+    assert finished.code == 2 and words in finished.errors and "Traceback" not in finished.errors + finished.output
+    left = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    assert "metrics.jsonl" not in left and not any(name.endswith(".ckpt") for name in left)

@@ -1,0 +1,139 @@
+"""The ebarf command as users type it: what it prints, what it leaves, and what it says when it cannot."""
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.scene import read_scene
+from tests.conftest import DATA, run_command, run_ok
+
+
+def test_help_lists_the_commands():
+    assert all(
+        name in run_ok("ebarf", "--help") for name in ("simulate", "process", "inspect", "trajectory", "evaluate")
+    )
+
+
+def test_inspect_for_people_and_for_programs(tiny_scene: Path):
+    text = run_ok("ebarf", "inspect", tiny_scene)
+    assert "48 x 36" in text and "threshold loss" in text and "11 keyframes" in text
+    summary = json.loads(run_ok("ebarf", "inspect", tiny_scene, "--json"))
+    assert summary["width"] == 48 and summary["events"] > 5000 and summary["end_us"] <= 500_000
+    assert summary["events_within_trajectory"] == summary["events"]
+
+
+def test_inspect_points_at_what_is_wrong(tiny_scene: Path, tmp_path: Path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    with h5py.File(scene / "events.h5", "r+") as file:
+        polarity = np.asarray(file["events/p"])
+        file["events/p"][...] = np.ones_like(polarity)  # pyright: ignore[reportIndexIssue]
+    lines = (scene / "trajectory.txt").read_text().splitlines()
+    (scene / "trajectory.txt").write_text("\n".join(lines[:7]))
+    text = run_ok("ebarf", "inspect", scene)
+    assert "100% of the events are brighter" in text and "outside the trajectory's span" in text
+
+
+def test_trajectory_compare_prints_one_object(tiny_scene: Path):
+    output = run_ok(
+        "ebarf", "trajectory", "compare", tiny_scene / "trajectory.txt", tiny_scene / "groundtruth.txt", "--json"
+    )
+    errors = json.loads(output)
+    assert errors["matched"] == 11 and errors["sim3"]["ate_m"] > 0 and errors["se3"]["rotation_deg"] > 0
+
+
+def test_trajectory_perturb_is_repeatable(tiny_scene: Path, tmp_path: Path):
+    for name in ("a.txt", "b.txt"):
+        run_ok("ebarf", "trajectory", "perturb", tiny_scene / "groundtruth.txt", tmp_path / name, "--seed=4")
+    assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
+    given, moved = read_tum(tiny_scene / "groundtruth.txt"), read_tum(tmp_path / "a.txt")
+    assert 0.01 < float((given.poses.position - moved.poses.position).std()) < 0.06
+
+
+def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):
+    shutil.rmtree(trained_run / "report")
+    numbers = json.loads(run_ok("ebarf", "evaluate", trained_run, "--json"))
+    assert numbers["method"] == "ebarf" and numbers["step"] == 80
+    page = Path(numbers["report"]).read_text()
+    assert "data:image/png;base64," in page and "<svg" in page and "http" not in page.split("</style>")[0]
+
+
+def test_simulate_with_a_knob_and_replacing_an_older_scene(tmp_path: Path):
+    short = ["--width=16", "--height=12", "--duration-s=0.2", "--focal-px=14"]
+    run_ok("ebarf", "simulate", tmp_path / "scene", *short)
+    few = json.loads(run_ok("ebarf", "inspect", tmp_path / "scene", "--json"))["events"]
+    run_ok("ebarf", "simulate", tmp_path / "scene", *short, "--threshold-on=0.1", "--threshold-off=0.1")
+    many = json.loads(run_ok("ebarf", "inspect", tmp_path / "scene", "--json"))["events"]
+    assert many > 1.8 * few > 0
+
+
+def test_process_ecd_makes_a_scene_of_a_real_recording(slider_depth: Path, tmp_path: Path):
+    before = {path: path.stat().st_mtime_ns for path in slider_depth.rglob("*")}
+    run_ok("ebarf", "process", "ecd", slider_depth, "--output", tmp_path / "slider")
+    assert {path: path.stat().st_mtime_ns for path in slider_depth.rglob("*")} == before
+    summary = json.loads(run_ok("ebarf", "inspect", tmp_path / "slider", "--json"))
+    assert summary["events"] == 50_000 and summary["start_us"] == 3811 and summary["frames"] == 4
+    scene = read_scene(tmp_path / "slider")
+    assert scene.camera.model == "radtan" and scene.camera.distortion[0] == pytest.approx(-0.1386, abs=1e-4)
+    assert scene.contrast_threshold is None
+
+
+def ecd_folder(folder: Path, **files: str) -> Path:
+    content = {
+        "events.txt": "0.0 1 1 0\n0.1 1 1 1\n0.2 1 1 1\n",
+        "calib.txt": "200 200 120 90 0 0 0 0 0",
+        "groundtruth.txt": "0.0 0 0 0 0 0 0 1\n0.2 1 0 0 0 0 0 1\n",
+        **{name.replace("_", "."): text for name, text in files.items()},
+    }
+    folder.mkdir()
+    for name, text in content.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_process_ecd_without_frames(tmp_path: Path):
+    run_ok("ebarf", "process", "ecd", ecd_folder(tmp_path / "raw"), "--output", tmp_path / "scene")
+    assert read_scene(tmp_path / "scene").frames == ()
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"events_txt": "0.1 1 1\n"}, "events.txt:1:"),
+        ({"events_txt": ""}, "holds no events"),
+        ({"calib_txt": "1 2 3"}, "calib.txt: holds '1 2 3', expected 9 numbers"),
+        ({"calib_txt": "a b c d e f g h i"}, "calib.txt: could not convert"),
+        ({"groundtruth_txt": "50 0 0 0 0 0 0 1\n51 0 0 0 0 0 0 1\n"}, "expected at least 2 poses around the events"),
+        ({"groundtruth_txt": "0 0 0 0 0 0 0 1\n200000 0 0 0 0 0 0 2\n"}, "has length 2, expected 1"),
+        ({"images_txt": "0.1 gone.png\n"}, "images.txt:1:"),
+    ],
+)
+def test_bad_source_is_one_line_exit_2_and_no_output(tmp_path: Path, files: dict[str, str], words: str):
+    finished = run_command("ebarf", "process", "ecd", ecd_folder(tmp_path / "raw", **files), "--output", tmp_path / "s")
+    assert finished.code == 2 and finished.errors.startswith("error: ") and words in finished.errors
+    assert finished.errors.count("\n") == 1 and [path.name for path in tmp_path.iterdir()] == ["raw"]
+
+
+def test_a_folder_that_is_no_scene_is_never_replaced(tmp_path: Path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    finished = run_command("ebarf", "simulate", tmp_path)
+    assert finished.code == 2 and "is not a scene folder" in finished.errors and (tmp_path / "thesis.tex").exists()
+
+
+def test_evaluate_of_no_run_is_one_line(tmp_path: Path):
+    finished = run_command("ebarf", "evaluate", tmp_path)
+    assert finished.code == 2 and "expected the folder of a training run" in finished.errors
+
+
+def test_swapped_columns_of_a_real_file_are_caught(tmp_path: Path, tiny_scene: Path):
+    swapped = DATA / "readers" / "swapped_xy.hdf5"
+    if not swapped.is_file():
+        pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    shutil.copy(swapped, scene / "events.h5")
+    finished = run_command("ebarf", "inspect", scene)
+    assert finished.code == 2 and "events.h5" in finished.errors

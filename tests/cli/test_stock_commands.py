@@ -1,0 +1,202 @@
+"""Every stock nerfstudio command, unpatched, on a trained tiny scene; what comes out is opened and judged."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import pytest
+import torch
+
+from ebarf_ns.evaluation.trajectory_error import trajectory_error
+from ebarf_ns.geometry.trajectory_file import read_tum
+from tests.conftest import TINY_TRAINING, run_ok
+
+needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render needs ffmpeg")
+
+
+def config(run: Path) -> list[object]:
+    return ["--load-config", run / "config.yml"]
+
+
+def assert_shows_something(path: Path) -> None:
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None, path
+    grey = image[..., :3].mean(axis=-1)
+    assert grey.std() > 5, f"{path} is nearly constant: {grey.mean():.1f} +- {grey.std():.1f}"
+
+
+def frames_of(video: Path) -> list[np.ndarray]:
+    capture, frames = cv2.VideoCapture(str(video)), []
+    while True:
+        there, frame = capture.read()
+        if not there:
+            return frames
+        frames.append(frame)
+
+
+def camera_path(folder: Path) -> Path:
+    """Two views from where the camera was, as the viewer writes them."""
+    view = np.array([[0.0, 0, -1, -0.5], [-1, 0, 0, 0], [0, 1, 0, 0.1], [0, 0, 0, 1]])
+    shifted = view.copy()
+    shifted[1, 3] += 0.1
+    path = {
+        "camera_type": "perspective", "render_height": 36, "render_width": 48, "fps": 4, "seconds": 0.5,
+        "camera_path": [
+            {"camera_to_world": pose.ravel().tolist(), "fov": 50, "aspect": 48 / 36} for pose in (view, shifted)
+        ],
+    }  # fmt: skip
+    (folder / "path.json").write_text(json.dumps(path))
+    return folder / "path.json"
+
+
+def test_train_refines_the_poses(trained_run: Path, tiny_scene: Path):
+    truth = read_tum(tiny_scene / "groundtruth.txt")
+    before, after = (
+        trajectory_error(read_tum(trained_run / f"trajectory_{which}.txt"), truth, "sim3")
+        for which in ("initial", "refined")
+    )
+    assert after.ate_m < before.ate_m and after.rotation_deg < before.rotation_deg
+    for picture in (trained_run / "renders").glob("*.png"):
+        assert_shows_something(picture)
+    assert any(trained_run.glob("events.out.tfevents.*"))
+
+
+def test_train_with_the_viewer(tiny_scene: Path, tmp_path: Path):
+    run_ok(
+        "ns-train", "ebarf", "--data", tiny_scene, "--output-dir", tmp_path, "--timestamp=run",
+        "--vis=viewer+tensorboard", "--viewer.websocket-port", free_port(),
+        "--viewer.quit-on-train-completion=True", *TINY_TRAINING, "--max-num-iterations=20",
+        "--steps-per-eval-image=10", "--steps-per-eval-batch=10", "--steps-per-eval-all-images=10",
+    )  # fmt: skip
+    assert (tmp_path / tiny_scene.name / "ebarf" / "run" / "metrics.jsonl").is_file()
+
+
+def test_train_resumes(trained_run: Path, tiny_scene: Path, tmp_path: Path):
+    run_ok(
+        "ns-train", "ebarf", "--data", tiny_scene, "--output-dir", tmp_path, "--timestamp=more", "--vis=tensorboard",
+        "--load-dir", trained_run / "nerfstudio_models", *TINY_TRAINING, "--max-num-iterations=100",
+    )  # fmt: skip
+    lines = (tmp_path / tiny_scene.name / "ebarf" / "more" / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["step"] == 100
+
+
+def test_eval(trained_run: Path, tmp_path: Path):
+    run_ok("ns-eval", *config(trained_run), "--output-path", tmp_path / "eval.json", "--render-output-path", tmp_path)
+    results = json.loads((tmp_path / "eval.json").read_text())["results"]
+    recorded = json.loads((trained_run / "metrics.jsonl").read_text().splitlines()[-1])
+    for name in ("psnr", "ssim", "heldout_event_loss", "ate_m", "rotation_deg"):
+        assert results[name] == pytest.approx(recorded[name], rel=1e-3)
+    assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("kind", ["camera-path", "interpolate", "spiral"])
+def test_render_video(trained_run: Path, tmp_path: Path, kind: str):
+    options = {
+        "camera-path": ["--camera-path-filename", camera_path(tmp_path)],
+        "interpolate": ["--interpolation-steps=2"],
+        "spiral": ["--seconds=0.3", "--frame-rate=10", "--radius=0.05"],
+    }[kind]
+    video = tmp_path / "out.mp4"
+    run_ok("ns-render", kind, *config(trained_run), "--output-path", video, *options)
+    frames = frames_of(video)
+    assert len(frames) >= 2 and all(frame.std() > 5 for frame in frames)
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("split", ["test", "train"])
+def test_render_dataset(trained_run: Path, tmp_path: Path, split: str):
+    run_ok(
+        "ns-render", "dataset", *config(trained_run), "--output-path", tmp_path, "--split", split,
+        "--rendered-output-names", "rgb", "depth", "gt-rgb",
+    )  # fmt: skip
+    pictures = sorted((tmp_path / split / "rgb").iterdir())
+    assert len(pictures) == (3 if split == "test" else 11)
+    for picture in pictures:
+        assert_shows_something(picture)
+
+
+def test_export_pointcloud(trained_run: Path, tmp_path: Path):
+    run_ok(
+        "ns-export", "pointcloud", *config(trained_run), "--output-dir", tmp_path, "--num-points=3000",
+        "--num-rays-per-batch=2048", "--normal-method=open3d", "--save-world-frame=True",
+    )  # fmt: skip
+    points = np.asarray(o3d.io.read_point_cloud(tmp_path / "point_cloud.ply").points)
+    assert len(points) > 2000
+    # In the world frame, the cloud lies within the scene's bounds and is not all in one place.
+    assert (points > -2.3).all() and (points < 2.3).all() and points.std(axis=0).min() > 0.05
+
+
+def test_export_tsdf(trained_run: Path, tmp_path: Path):
+    run_ok(
+        "ns-export", "tsdf", *config(trained_run), "--output-dir", tmp_path, "--resolution=32",
+        "--target-num-faces=500", "--unwrap-method=custom", "--num-pixels-per-side=256",
+    )  # fmt: skip
+    mesh = o3d.io.read_triangle_mesh(tmp_path / "tsdf_mesh.ply")
+    assert len(mesh.vertices) > 50 and len(mesh.triangles) > 50
+
+
+def test_export_poisson(trained_run: Path, tmp_path: Path):
+    run_ok(
+        "ns-export", "poisson", *config(trained_run), "--output-dir", tmp_path, "--num-points=3000",
+        "--num-rays-per-batch=2048", "--normal-method=open3d", "--texture-method=point_cloud",
+        "--target-num-faces=1000",
+    )  # fmt: skip
+    mesh = o3d.io.read_triangle_mesh(tmp_path / "poisson_mesh.ply")
+    assert len(mesh.vertices) > 50
+
+
+def test_export_cameras_are_the_refined_keyframes(trained_run: Path, tmp_path: Path):
+    run_ok("ns-export", "cameras", *config(trained_run), "--output-dir", tmp_path)
+    exported = json.loads((tmp_path / "transforms_train.json").read_text())
+    normalization = json.loads((trained_run / "dataparser_transforms.json").read_text())
+    position = torch.tensor([frame["transform"] for frame in exported])[:, :3, 3].double()
+    world = position / normalization["scale"] - torch.tensor(normalization["transform"])[:, 3]
+    refined = read_tum(trained_run / "trajectory_refined.txt").poses.position
+    initial = read_tum(trained_run / "trajectory_initial.txt").poses.position
+    assert torch.allclose(world, refined, atol=1e-4) and not torch.allclose(world, initial, atol=1e-3)
+
+
+def test_viewer_serves_its_page(trained_run: Path):
+    port = free_port()
+    script = Path(sys.executable).parent / "ns-viewer"
+    process = subprocess.Popen(
+        [script, "--load-config", trained_run / "config.yml", "--viewer.websocket-port", str(port)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=os.environ,
+    )  # fmt: skip
+    try:
+        page = wait_for_page(f"http://127.0.0.1:{port}", process)
+        assert "<title>" in page.lower()
+        # Long enough for the scene to be built and a first picture to be rendered.
+        time.sleep(3)
+        assert process.poll() is None
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait_for_page(address: str, process: subprocess.Popen, patience_s: float = 120) -> str:
+    end = time.monotonic() + patience_s
+    while time.monotonic() < end:
+        assert process.poll() is None, process.stdout.read().decode() if process.stdout else ""
+        try:
+            with urllib.request.urlopen(address, timeout=5) as answer:
+                return answer.read().decode(errors="replace")
+        except OSError:
+            time.sleep(1)
+    raise AssertionError(f"{address} did not answer in {patience_s} s")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
