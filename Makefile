@@ -1,6 +1,8 @@
 # make demo: from nothing to a trained scene. make test: from nothing to green tests.
 VENV ?= .venv
+DEMO ?= demo
 DEMO_SECONDS ?= 120
+RUN := $(DEMO)/runs/scene/ebarf/run
 BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 
@@ -24,15 +26,15 @@ test-slow: check
 	pytest -m "slow"
 
 demo: setup
-	rm -rf demo/runs
-	ebarf simulate demo/scene
-	ebarf inspect demo/scene
-	ns-train ebarf --data demo/scene --output-dir demo/runs --experiment-name scene --timestamp run \
+	rm -rf $(DEMO)/runs
+	ebarf simulate $(DEMO)/scene
+	ebarf inspect $(DEMO)/scene
+	ns-train ebarf --data $(DEMO)/scene --output-dir $(DEMO)/runs --experiment-name scene --timestamp run \
 		--max-train-seconds $(DEMO_SECONDS) --vis tensorboard --logging.local-writer.enable False
-	ns-eval --load-config demo/runs/scene/ebarf/run/config.yml --output-path demo/runs/evaluation.json
-	ebarf evaluate demo/runs/scene/ebarf/run
+	ns-eval --load-config $(RUN)/config.yml --output-path $(RUN)/evaluation.json
+	ebarf evaluate $(RUN)
 	@echo
-	@echo "report with plots   demo/runs/scene/ebarf/run/report/report.html"
-	@echo "renders, references demo/runs/scene/ebarf/run/renders/"
-	@echo "refined trajectory  demo/runs/scene/ebarf/run/trajectory_refined.txt"
-	@echo "viewer              $(BIN)/ns-viewer --load-config demo/runs/scene/ebarf/run/config.yml"
+	@echo "report with plots     $(RUN)/report/report.html"
+	@echo "renders, references   $(RUN)/renders/"
+	@echo "refined trajectory    $(RUN)/trajectory_refined.txt"
+	@echo "viewer                $(BIN)/ns-viewer --load-config $(RUN)/config.yml"

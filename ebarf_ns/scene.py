@@ -66,7 +66,8 @@ def read_scene(folder: Path) -> Scene:
     frames = content.optional_file("frames")
     return Scene(
         folder=folder,
-        events=content.file("events"),
+        # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
+        events=content.file("events", must_exist=False),
         trajectory=content.file("trajectory"),
         camera=camera,
         groundtruth=content.optional_file("groundtruth"),
@@ -162,12 +163,12 @@ class _Object:
             raise self.wrong(key, "a JSON object")
         return _Object(self.path, self.name(key), self.get(key))
 
-    def file(self, key: str) -> Path:
+    def file(self, key: str, must_exist: bool = True) -> Path:
         name = self.get(key)
         if not isinstance(name, str) or not name:
             raise self.wrong(key, "a file name")
         path = self.path.parent / name
-        if not path.is_file():
+        if must_exist and not path.is_file():
             raise SceneError(f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}")
         return path
 

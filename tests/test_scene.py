@@ -63,7 +63,7 @@ def camera(**changes: object) -> dict:
         (changed(format="other"), "format is 'other', expected 'ebarf-scene'"),
         (changed(version=2), "version is 2, expected 1"),
         (changed(evnets="x"), "unknown key evnets"),
-        (changed(events="gone.h5"), "events names 'gone.h5', but there is no file"),
+        (changed(trajectory="gone.txt"), "trajectory names 'gone.txt', but there is no file"),
         (changed(events=3), "events is 3, expected a file name"),
         (changed(groundtruth="gone.txt"), "groundtruth names 'gone.txt'"),
         (changed(camera=None), "camera is None, expected a JSON object"),

@@ -50,7 +50,7 @@ def read_recording(path: Path, width: int, height: int) -> Recording:
             columns = {name: _read_column(file, path, name) for name in ("x", "y", "t", "p")}
             t_offset_us = int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
     except OSError as error:
-        reason = "no such file" if not path.exists() else f"not a readable HDF5 file ({error})"
+        reason = "no such file, expected the recording" if not path.exists() else f"not a readable HDF5 file ({error})"
         raise RecordingError(f"{path}: {reason}") from None
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:

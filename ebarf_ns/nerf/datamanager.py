@@ -15,7 +15,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ebarf_ns.errors import EbarfError, RecordingError
+from ebarf_ns.errors import EbarfError, RecordingError, one_line_errors
 from ebarf_ns.events.pairs import (
     EventPairs,
     PairIndex,
@@ -150,7 +150,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         random = batch_random(self.config.seed, batch * self.world_size + self.local_rank)
         count = self.get_train_rays_per_batch() // 2
         steps = draw_steps(count, self.config.longest_pair, random)
-        return self._rays(self.pairs[0].sample(steps, random))
+        with one_line_errors():
+            return self._rays(self.pairs[0].sample(steps, random))
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
         """Rays of the held-out pairs, the same for every step, method and seed."""

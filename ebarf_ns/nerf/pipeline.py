@@ -20,6 +20,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization
 from ebarf_ns.nerf.model import EbarfModel
+from ebarf_ns.photometry.event_loss import reported_change
 from ebarf_ns.scene import Frame, Scene
 
 _ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
@@ -74,14 +75,14 @@ class EbarfPipeline(VanillaPipeline):
         self.train()
         return results
 
-    def _heldout_event_loss(self) -> float:
+    def _heldout_event_loss(self) -> float | None:
+        if not self.scene.events.is_file() or not self.datamanager.pairs[1].max_steps:
+            return None
         rays, batch = self.datamanager.next_eval(0)
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)
         polarity_sum, event_count = batch["polarity_sum"].cpu(), batch["event_count"].cpu()
         threshold = self.scene.contrast_threshold
         on, off = (threshold.on, threshold.off) if threshold else (1.0, 1.0)
-        from ebarf_ns.photometry.event_loss import reported_change
-
         reported = reported_change(polarity_sum, event_count, on, off).double()
         return unexplained_share((after - before).numpy(), reported.numpy(), event_count.double().numpy())
 
@@ -95,15 +96,16 @@ class EbarfPipeline(VanillaPipeline):
                 rendered.append(outputs["brightness"][..., 0].double().cpu().numpy())
                 references.append(read_frame(frames[path]))
                 names.append(path.stem)
+        outside = {"frames_outside_span": float(len(frames) - len(rendered))} if frames else {}
         if not rendered:
-            return {}
+            return outside
         if renders:
             white = max(float(image.max()) for image in references)
             for name, fitted, reference in zip(names, fit_brightness(rendered, references), references, strict=True):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
                 with whole_file(renders / f"{name}.png") as temporary:
                     cv2.imwrite(str(temporary), (beside * 255).round().astype(np.uint8))
-        return {**image_errors(rendered, references), "frames": float(len(rendered))}
+        return {**image_errors(rendered, references), "frames": float(len(rendered)), **outside}
 
     def _trajectory_errors(self) -> dict[str, float | None]:
         if self.scene.groundtruth is None:

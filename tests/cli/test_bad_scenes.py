@@ -54,7 +54,7 @@ def scaled_times(factor: float) -> Callable[[list[str]], list[str]]:
 
 
 CASES = {
-    "no events file": (lambda scene: (scene / "events.h5").unlink(), "events names 'events.h5'"),
+    "no events file": (lambda scene: (scene / "events.h5").unlink(), "no such file, expected the recording"),
     "wrong key": (edit_json(evnets=1), "unknown key evnets"),
     "unsorted": (edit_column("t", lambda t: t[::-1]), "/events/t row 1 is"),
     "ragged": (edit_column("x", lambda x: x[:-1]), "differ in length"),

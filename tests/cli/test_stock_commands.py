@@ -18,7 +18,7 @@ import torch
 
 from ebarf_ns.evaluation.trajectory_error import trajectory_error
 from ebarf_ns.geometry.trajectory_file import read_tum
-from tests.conftest import TINY_TRAINING, run_ok
+from tests.conftest import TINY_TRAINING, run_command, run_ok
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render needs ffmpeg")
 
@@ -164,6 +164,24 @@ def test_export_cameras_are_the_refined_keyframes(trained_run: Path, tmp_path: P
     refined = read_tum(trained_run / "trajectory_refined.txt").poses.position
     initial = read_tum(trained_run / "trajectory_initial.txt").poses.position
     assert torch.allclose(world, refined, atol=1e-4) and not torch.allclose(world, initial, atol=1e-3)
+
+
+def test_a_run_outlives_its_recording(tiny_scene: Path, tmp_path: Path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    run_ok(
+        "ns-train", "ebarf", "--data", scene, "--output-dir", tmp_path, "--timestamp=run", "--vis=tensorboard",
+        *TINY_TRAINING, "--max-num-iterations=20",
+    )  # fmt: skip
+    (scene / "events.h5").unlink()
+    run = tmp_path / "scene" / "ebarf" / "run"
+    run_ok("ns-eval", *config(run), "--output-path", tmp_path / "eval.json")
+    results = json.loads((tmp_path / "eval.json").read_text())["results"]
+    assert results["heldout_event_loss"] is None and results["psnr"] > 5
+    run_ok("ns-export", "cameras", *config(run), "--output-dir", tmp_path / "cameras")
+    finished = run_command(
+        "ns-export", "pointcloud", *config(run), "--output-dir", tmp_path / "cloud", "--normal-method=open3d"
+    )
+    assert finished.code == 2 and "no such file, expected the recording" in finished.errors
 
 
 def test_viewer_serves_its_page(trained_run: Path):

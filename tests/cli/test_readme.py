@@ -1,0 +1,72 @@
+"""Every command of the README is run, with less time to train."""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ebarf_ns.scene import read_scene
+from tests.conftest import REPOSITORY, run_ok
+
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", README, re.S)]
+
+
+def test_make_demo_goes_from_nothing_to_a_report(tmp_path: Path):
+    environment = Path(sys.executable).parent.parent
+    if not (environment / ".installed").exists():
+        pytest.skip(f"{environment} was not made by make setup")
+    finished = subprocess.run(
+        ["make", "-C", REPOSITORY, "demo", f"VENV={environment}", f"DEMO={tmp_path}", "DEMO_SECONDS=5"],
+        capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert finished.returncode == 0, finished.stdout[-2000:] + finished.stderr[-2000:]
+    run = tmp_path / "runs" / "scene" / "ebarf" / "run"
+    for name in ("report/report.html", "report/trajectory.svg", "renders/0000.png", "trajectory_refined.txt"):
+        assert (run / name).stat().st_size > 500
+        assert str(run / name.split("/", maxsplit=1)[0]) in finished.stdout
+    assert json.loads((run / "evaluation.json").read_text())["results"]["psnr"] > 10
+
+
+def test_the_first_block_is_the_two_commands_of_the_makefile():
+    targets = re.findall(r"^make (\w+)", "\n".join(BLOCKS[0]), re.M)
+    assert targets == ["demo", "test"]
+    makefile = (REPOSITORY / "Makefile").read_text()
+    assert all(f"\n{target}:" in makefile for target in targets)
+
+
+def test_the_real_recording_block_runs(slider_depth: Path, tmp_path: Path):
+    (block,) = [block for block in BLOCKS if any("slider_depth" in line for line in block)]
+    shutil.copytree(slider_depth, tmp_path / "slider_depth")
+    for line in block:
+        words = shlex.split(line.replace("--max-train-seconds 120", "--max-train-seconds 5"))
+        run_ok(*words, cwd=tmp_path)
+    (metrics,) = (tmp_path / "outputs").rglob("metrics.jsonl")
+    last = json.loads(metrics.read_text().splitlines()[-1])
+    assert last["heldout_event_loss"] < 1 and last["ate_m_orientation"] < 0.05
+
+
+def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
+    (content,) = re.findall(r"```json\n(.*?)```", README, re.S)
+    (tmp_path / "scene.json").write_text(content)
+    for name in ("events.h5", "trajectory.txt"):
+        (tmp_path / name).touch()
+    assert read_scene(tmp_path).camera.model == "radtan"
+
+
+def test_the_table_names_commands_that_exist():
+    commands = re.findall(r"^\| `(ebarf [a-z ]+|ns-[a-z]+)", README, re.M)
+    assert len(commands) >= 7
+    for command in commands:
+        words = [word for word in command.split() if word.islower()]
+        assert "usage" in run_ok(*words, "--help").lower()
+
+
+def test_its_picture_is_there():
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", README, re.S):
+        assert (REPOSITORY / picture).stat().st_size > 10_000
