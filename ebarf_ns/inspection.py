@@ -1,8 +1,7 @@
 """What is in a scene folder, and what looks wrong in it."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -170,8 +169,3 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
             f"{summary.frames} validation frames, {'ground truth' if summary.groundtruth else 'no ground truth'}",
         ),
     ]
-
-
-def summary_json(summary: Summary) -> dict[str, Any]:
-    """For a program."""
-    return asdict(summary)

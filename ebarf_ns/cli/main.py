@@ -69,11 +69,11 @@ class Inspect:
 
     def run(self) -> None:
         """Print the summary."""
-        from ebarf_ns.inspection import inspect_scene, print_summary, summary_json
+        from ebarf_ns.inspection import inspect_scene, print_summary
 
         summary = inspect_scene(self.scene)
         if self.json:
-            _print_json(summary_json(summary))
+            _print_json(asdict(summary))
         else:
             print_summary(summary, self.scene)
 

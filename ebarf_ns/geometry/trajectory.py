@@ -41,10 +41,6 @@ class Trajectory(NamedTuple):
     t_us: Int64[Tensor, "keyframes"]
     poses: Poses
 
-    def double(self) -> "Trajectory":
-        """The same in float64."""
-        return Trajectory(self.t_us, Poses(self.poses.position.double(), self.poses.quat_wxyz.double()))
-
 
 def check_keyframes(t_us: Int64[Tensor, "keyframes"]) -> None:
     """Raise :class:`TrajectoryError` unless there are two keyframes or more, in strictly increasing time."""
