@@ -5,15 +5,18 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 from evo.core import metrics
 from evo.core.geometry import GeometryException
 from evo.core.lie_algebra import se3
 from evo.core.trajectory import PosePath3D
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError
-from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.geometry.so3 import quat_wxyz_multiply, rotate
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
 from ebarf_ns.geometry.trajectory_file import read_tum
 
 Alignment = Literal["se3", "sim3", "orientation"]
@@ -156,3 +159,19 @@ def compare_files(estimate: Path, reference: Path) -> dict[str, Any]:
     notes = [f"{path.name}: seconds, quaternions x y z w, as TUM has them" for path in (estimate, reference)]
     sim3 = comparison["sim3"]
     return {**comparison, "scale": sim3 and sim3["scale"], "notes": notes + reasons}
+
+
+def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_us: Int64[Tensor, "times"]) -> Poses:
+    """The reference's poses at ``t_us``, moved into the estimate's world by the inverse of the sim3 alignment.
+
+    For frames outside the estimate's span. Raises :class:`EvaluationError` where the alignment is not defined.
+    """
+    estimated, true = _matched(estimate, reference)
+    try:
+        rotation, shift, scale = estimated.align(true, correct_scale=True)
+    except GeometryException as error:
+        raise EvaluationError(f"the trajectory cannot be aligned to the reference: {error}") from None
+    poses = interpolate(reference.t_us, reference.poses, t_us)
+    back = torch.from_numpy(Rotation.from_matrix(rotation.T).as_quat()[[3, 0, 1, 2]]).expand(len(t_us), 4)
+    position = rotate(back, poses.position - torch.from_numpy(shift)) / float(scale)
+    return Poses(position, quat_wxyz_multiply(back, poses.quat_wxyz))

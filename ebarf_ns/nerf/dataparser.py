@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -19,7 +19,7 @@ from ebarf_ns.errors import SceneError, one_line_errors
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.scene import Scene, read_scene
+from ebarf_ns.scene import Frame, Scene, read_scene
 
 # Without bounds, the trajectory fills this share of the part of space that is not contracted.
 _TRAJECTORY_SHARE = 0.25
@@ -89,7 +89,7 @@ class EbarfDataParser(DataParser):
     def _keyframe_views(self, keyframes: Trajectory, every: int = 1) -> tuple[Cameras, list[Path]]:
         chosen = Trajectory(keyframes.t_us[::every], Poses(*(column[::every] for column in keyframes.poses)))
         files = [self.scene.folder / "keyframes" / f"{t_us}.png" for t_us in chosen.t_us.tolist()]
-        return _nerfstudio_cameras([self.scene.camera] * len(files), chosen), files
+        return _nerfstudio_cameras([self.scene.camera] * len(files), chosen.t_us, chosen.poses.matrix()), files
 
     def _evaluation_views(self, keyframes: Trajectory) -> tuple[Cameras, list[Path]]:
         """The frames within the trajectory's span, or else a few keyframes, so that there is something to look at."""
@@ -98,15 +98,8 @@ class EbarfDataParser(DataParser):
         frames = [frame for frame, keep in zip(self.scene.frames, inside.tolist(), strict=True) if keep]
         if not frames:
             return self._keyframe_views(keyframes, max(1, len(keyframes.t_us) // _STAND_IN_VIEWS))
-        event_camera = interpolate(keyframes.t_us, keyframes.poses, times[inside])
-        extrinsic = torch.tensor([frame.event_camera_from_frame_camera for frame in frames])
-        extrinsic[:, :3, 3] *= self.normalization.scale
-        rotation = event_camera.matrix()[:, :, :3] @ extrinsic[:, :3, :3]
-        position = event_camera.matrix()[:, :, :3] @ extrinsic[:, :3, 3:] + event_camera.position[..., None]
-        cameras = _nerfstudio_cameras(
-            [frame.camera for frame in frames], times[inside], torch.cat([rotation, position], dim=-1)
-        )
-        return cameras, [frame.path for frame in frames]
+        event_camera = Trajectory(times[inside], interpolate(keyframes.t_us, keyframes.poses, times[inside]))
+        return frame_cameras(frames, event_camera, self.normalization.scale), [frame.path for frame in frames]
 
 
 def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:
@@ -133,13 +126,20 @@ def opengl_from_opencv(camera_to_world: Float[Tensor, "*batch 3 4"]) -> Float[Te
     return camera_to_world * _OPENGL_FROM_OPENCV.to(camera_to_world)
 
 
-def _nerfstudio_cameras(
-    cameras: list[Camera], times: Trajectory | Tensor, camera_to_world: Tensor | None = None
-) -> Cameras:
-    if isinstance(times, Trajectory):
-        times, camera_to_world = times.t_us, times.poses.matrix()
-    assert camera_to_world is not None
+def frame_cameras(frames: list[Frame], event_camera: Trajectory, scale: float) -> Cameras:
+    """The cameras of frames, given the event camera's pose in training coordinates at each frame's time."""
+    mount = torch.tensor([frame.event_camera_from_frame_camera for frame in frames])
+    pose = event_camera.poses.matrix()
+    rotation = pose[:, :, :3] @ mount[:, :3, :3]
+    position = pose[:, :, :3] @ (scale * mount[:, :3, 3:]) + pose[:, :, 3:]
+    return _nerfstudio_cameras(
+        [frame.camera for frame in frames], event_camera.t_us, torch.cat([rotation, position], dim=-1)
+    )
 
+
+def _nerfstudio_cameras(
+    cameras: list[Camera], t_us: Int64[Tensor, "cameras"], camera_to_world: Float[Tensor, "cameras 3 4"]
+) -> Cameras:
     def column(name: str) -> Tensor:
         return torch.tensor([[getattr(camera, name)] for camera in cameras])
 
@@ -157,7 +157,7 @@ def _nerfstudio_cameras(
         camera_type=[
             CameraType.FISHEYE if camera.model == "equidistant" else CameraType.PERSPECTIVE for camera in cameras
         ],
-        metadata={"camera_t_us": times[:, None]},
+        metadata={"camera_t_us": t_us[:, None]},
     )
 
 

@@ -1,5 +1,6 @@
 """Training steps and evaluation of a model on its scene."""
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -7,21 +8,30 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError, one_line_errors
 from ebarf_ns.evaluation.frames import fit_brightness, image_errors, read_frame
 from ebarf_ns.evaluation.heldout import unexplained_share
-from ebarf_ns.evaluation.trajectory_error import Alignment, trajectory_error
+from ebarf_ns.evaluation.trajectory_error import (
+    Alignment,
+    reference_in_estimates_world,
+    trajectory_error,
+)
 from ebarf_ns.files import whole_file
-from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.geometry.trajectory import Trajectory, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.datamanager import EventDataManager
-from ebarf_ns.nerf.dataparser import Normalization
+from ebarf_ns.nerf.dataparser import Normalization, frame_cameras
 from ebarf_ns.nerf.model import EbarfModel
 from ebarf_ns.photometry.event_loss import reported_change
 from ebarf_ns.scene import Frame, Scene
+
+# nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
+warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
+warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True to a scalar")
 
 _ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
 """How refined and reference trajectory are aligned, and the suffix that says so in the results."""
@@ -87,25 +97,49 @@ class EbarfPipeline(VanillaPipeline):
         return unexplained_share((after - before).numpy(), reported.numpy(), event_count.double().numpy())
 
     def _image_errors(self, renders: Path | None) -> dict[str, float]:
+        """Frames at the refined pose of their time, and apart from them those outside the trajectory's span."""
         dataset = self.datamanager.eval_dataset
-        frames: dict[Path, Frame] = {frame.path: frame for frame in self.scene.frames}
-        rendered, references, names = [], [], []
-        for index, path in enumerate(dataset.image_filenames):
-            if path in frames:
-                outputs = self.model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(self.device))
-                rendered.append(outputs["brightness"][..., 0].double().cpu().numpy())
-                references.append(read_frame(frames[path]))
-                names.append(path.stem)
-        outside = {"frames_outside_span": float(len(frames) - len(rendered))} if frames else {}
-        if not rendered:
-            return outside
+        by_path = {frame.path: frame for frame in self.scene.frames}
+        within = [by_path.pop(path) for path in dataset.image_filenames if path in by_path]
+        results = self._compare(within, dataset.cameras, renders) if within else {}
+        outside = list(by_path.values())
+        results |= {"frames_outside_span": float(len(outside))} if outside else {}
+        cameras = self._cameras_at_reference(outside) if outside else None
+        if cameras is not None:
+            results |= {f"{name}_outside_span": value for name, value in self._compare(outside, cameras).items()}
+        return results
+
+    def _cameras_at_reference(self, frames: list[Frame]) -> Cameras | None:
+        if self.scene.groundtruth is None:
+            return None
+        reference = read_tum(self.scene.groundtruth)
+        t_us = torch.tensor([frame.t_us for frame in frames])
+        if not within_span(t_us, reference.t_us).all():
+            return None
+        try:
+            poses = reference_in_estimates_world(self.trajectory(), reference, t_us)
+        except EvaluationError:
+            return None
+        normalization: Normalization = self.datamanager.train_dataset.metadata["normalization"]
+        cameras = frame_cameras(frames, normalization.apply(Trajectory(t_us, poses)), normalization.scale)
+        # Without their times, cameras are not moved along with the refined trajectory.
+        cameras.metadata = {}
+        return cameras
+
+    def _compare(self, frames: list[Frame], cameras: Cameras, renders: Path | None = None) -> dict[str, float]:
+        rendered = [
+            self.model.get_outputs_for_camera(cameras[k : k + 1].to(self.device))["brightness"][..., 0].double()
+            for k in range(len(frames))
+        ]
+        rendered = [image.cpu().numpy() for image in rendered]
+        references = [read_frame(frame) for frame in frames]
         if renders:
             white = max(float(image.max()) for image in references)
-            for name, fitted, reference in zip(names, fit_brightness(rendered, references), references, strict=True):
+            for frame, fitted, reference in zip(frames, fit_brightness(rendered, references), references, strict=True):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
-                with whole_file(renders / f"{name}.png") as temporary:
+                with whole_file(renders / f"{frame.path.stem}.png") as temporary:
                     cv2.imwrite(str(temporary), (beside * 255).round().astype(np.uint8))
-        return {**image_errors(rendered, references), "frames": float(len(rendered)), **outside}
+        return {**image_errors(rendered, references), "frames": float(len(frames))}
 
     def _trajectory_errors(self) -> dict[str, float | None]:
         if self.scene.groundtruth is None:

@@ -6,7 +6,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import EvaluationError
-from ebarf_ns.evaluation.trajectory_error import aligned_positions, compare_files, trajectory_error
+from ebarf_ns.evaluation.trajectory_error import (
+    aligned_positions,
+    compare_files,
+    reference_in_estimates_world,
+    trajectory_error,
+)
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import write_tum
 
@@ -97,3 +102,13 @@ def test_files_are_compared_with_every_alignment(tmp_path):
         write_tum(tmp_path / name, make(position, turn))
     comparison = compare_files(tmp_path / "a.txt", tmp_path / "b.txt")
     assert comparison["matched"] == 20 and comparison["sim3"]["ate_m"] < 1e-6 and len(comparison["notes"]) == 2
+
+
+def test_reference_poses_are_found_in_the_estimates_world():
+    position, turn = wander()
+    world = Rotation.random(rng=np.random.default_rng(4))
+    estimate = make(2 * world.apply(position) + 5, world * turn)
+    reference = make(position, turn)
+    placed = reference_in_estimates_world(estimate, reference, reference.t_us)
+    assert torch.allclose(placed.position, estimate.poses.position, atol=1e-9)
+    assert torch.allclose(placed.matrix(), estimate.poses.matrix(), atol=1e-9)

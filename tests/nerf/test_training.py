@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,18 @@ def test_each_method_leaves_trajectories_metrics_and_report(tiny_scene: Path, tm
     moved = (refined.poses.position - initial.poses.position).abs().max()
     assert moved < 1e-5 if name == "enerf" else moved > 1e-4
     assert (run / "report" / "report.html").stat().st_size > 10_000
+
+
+def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    lines = (scene / "trajectory.txt").read_text().splitlines()
+    (scene / "trajectory.txt").write_text("\n".join(lines[:8]))
+    ready = trainer(config(scene, tmp_path, steps=40))
+    ready.train()
+    results = ready.pipeline.evaluate()
+    assert results["frames"] == 2 and results["frames_outside_span"] == 1
+    # Less is seen of it, but a wrong place would show nothing of the room at all.
+    assert results["psnr_outside_span"] and 8 < results["psnr_outside_span"] < 60
 
 
 def test_seconds_end_a_run_and_drive_its_schedules(tiny_scene: Path, tmp_path: Path):
