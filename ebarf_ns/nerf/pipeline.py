@@ -53,6 +53,15 @@ class EbarfPipeline(VanillaPipeline):
     def __init__(self, *args: Any, **kwargs: Any):
         with one_line_errors():
             super().__init__(*args, **kwargs)
+            if self.test_mode == "val":
+                self._check_references()
+
+    def _check_references(self) -> None:
+        """Read what evaluation will need, so that a mistake in it does not end a run halfway."""
+        for frame in self.scene.frames:
+            read_frame(frame)
+        if self.scene.groundtruth:
+            read_tum(self.scene.groundtruth)
 
     @property
     def scene(self) -> Scene:

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -69,6 +70,11 @@ CASES = {
     "bounds elsewhere": (edit_json(bounds=[[90, 90, 90], [91, 91, 91]]), "hold none of the 11 keyframes"),
 }
 ONLY_TRAINING = {
+    "frame of another size": (
+        lambda scene: cv2.imwrite(str(scene / "frames" / "0001.png"), np.zeros((9, 7), np.uint8)),
+        "0001.png: 7x9 pixels, expected the camera's 48x36",
+    ),
+    "spoilt ground truth": (lambda scene: (scene / "groundtruth.txt").write_text("0 1 2"), "groundtruth.txt:1: 3 col"),
     "another clock": (edit_trajectory(lambda lines: [f"7{line}" for line in lines]), "none of the"),
     "milliseconds": (edit_trajectory(scaled_times(1e6)), "expected the same clock and, in the trajectory, seconds"),
 }
