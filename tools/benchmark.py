@@ -5,7 +5,9 @@ python tools/benchmark.py OUTPUT.json --methods ebarf enerf --seconds 100 --seed
 
 import argparse
 import json
+import os
 import platform
+import shlex
 import statistics
 import subprocess
 import sys
@@ -28,6 +30,14 @@ def run(*words: object) -> None:
     """Run a console script of this environment."""
     name, *arguments = map(str, words)
     subprocess.run([Path(sys.executable).parent / name, *arguments], check=True, stdout=subprocess.DEVNULL)
+
+
+def processor() -> str:
+    """What the machine calls its processor."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def train(method: str, scene: Path, seconds: float, seed: int, folder: Path) -> dict[str, Any]:
@@ -73,8 +83,12 @@ def main() -> None:
             for method in options.methods:
                 records.append(train(method, scene, options.seconds, seed, folder))
                 print(records[-1], flush=True)
-    machine = f"{platform.machine()}, {platform.system()}"
-    content = {"date": date.today().isoformat(), "machine": machine, "records": records}
+    content = {
+        "date": date.today().isoformat(),
+        "machine": f"{os.cpu_count()} cores of {processor()}",
+        "command": shlex.join(["python", *sys.argv]),
+        "records": records,
+    }
     options.output.write_text(json.dumps(content, indent=1) + "\n")
     print(table(records))
 

@@ -44,7 +44,7 @@ def test_the_real_recording_block_runs(slider_depth: Path, tmp_path: Path):
     (block,) = [block for block in BLOCKS if any("slider_depth" in line for line in block)]
     shutil.copytree(slider_depth, tmp_path / "slider_depth")
     for line in block:
-        words = shlex.split(line.replace("--max-train-seconds 120", "--max-train-seconds 5"))
+        words = shlex.split(line.replace("--max-train-seconds 60", "--max-train-seconds 5"))
         run_ok(*words, cwd=tmp_path)
     (metrics,) = (tmp_path / "outputs").rglob("metrics.jsonl")
     last = json.loads(metrics.read_text().splitlines()[-1])
