@@ -26,7 +26,7 @@ test-slow: check
 	pytest -m "slow"
 
 demo: setup
-	rm -rf $(DEMO)/runs
+	rm -rf $(DEMO)/scene $(DEMO)/runs
 	ebarf simulate $(DEMO)/scene
 	ebarf inspect $(DEMO)/scene
 	ns-train ebarf --data $(DEMO)/scene --output-dir $(DEMO)/runs --experiment-name scene --timestamp run \

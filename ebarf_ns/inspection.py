@@ -7,10 +7,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ebarf_ns.evaluation.frames import read_frame
 from ebarf_ns.events.recording import Recording, read_recording
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.scene import Scene, read_scene
+from ebarf_ns.scene import Scene, check_bounds, read_scene
 
 _HOT_RATIO = 50
 _FEW_EVENTS_PER_PIXEL = 5
@@ -45,12 +46,15 @@ class Summary:
 
 
 def inspect_scene(folder: Path) -> Summary:
-    """Read the whole scene; raises the reader's error for anything that training would stumble over."""
+    """Read the whole scene; raises the reader's error for any file that training would stumble over."""
     scene = read_scene(folder)
     recording = read_recording(scene.events, scene.camera.width, scene.camera.height)
     trajectory = read_tum(scene.trajectory)
+    check_bounds(scene, trajectory)
     if scene.groundtruth:
         read_tum(scene.groundtruth)
+    for frame in scene.frames:
+        read_frame(frame)
     summary = _summarize(scene, recording, trajectory)
     summary.suspicions.extend(_suspicions(scene, summary, trajectory))
     return summary

@@ -1,17 +1,19 @@
 """The scene folder: scene.json and the files it names, read, validated and written."""
 
 import json
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
+from ebarf_ns.geometry.trajectory import Trajectory
 
 FORMAT, VERSION = "ebarf-scene", 1
 FrameIntensity = Literal["linear", "srgb", "log"]
@@ -77,6 +79,19 @@ def read_scene(folder: Path) -> Scene:
         else None,
         bounds=_bounds(content) if content.get("bounds") is not None else None,
     )
+
+
+def check_bounds(scene: Scene, trajectory: Trajectory) -> None:
+    """Raise :class:`SceneError` when the bounds hold none of the keyframes."""
+    if scene.bounds is None:
+        return
+    lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
+    position = trajectory.poses.position
+    if ((position < lower) | (position > upper)).any(dim=-1).all():
+        raise SceneError(
+            f"{scene.folder / 'scene.json'}: bounds {scene.bounds} hold none of the {len(position)} keyframes of "
+            f"{scene.trajectory.name}, the first of which is at {position[0].tolist()}; expected bounds around them"
+        )
 
 
 def write_scene(scene: Scene) -> None:
@@ -194,7 +209,8 @@ class _Object:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # Comparing is safe for integers of any length, which do not fit a float.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _camera(content: _Object) -> Camera:
@@ -253,6 +269,6 @@ def _frame(content: _Object, event_camera: Camera) -> Frame:
         path=content.file("file"),
         t_us=content.integer("t_us"),
         camera=_camera(content.object("camera")) if content.get("camera") is not None else event_camera,
-        event_camera_from_frame_camera=tuple(map(tuple, extrinsic or np.eye(4).tolist())),
+        event_camera_from_frame_camera=tuple(tuple(map(float, row)) for row in extrinsic or np.eye(4).tolist()),
         intensity=content.choice("intensity", get_args(FrameIntensity)),
     )

@@ -72,6 +72,7 @@ def camera(**changes: object) -> dict:
         (camera(width=24.5), "camera.width is 24.5, expected an integer"),
         (camera(fx=-1), "camera.fx is -1, expected a finite number above 0"),
         (camera(cx=float("nan")), "camera.cx is nan, expected a finite number"),
+        (camera(cy=10**400), "camera.cy is 1000"),
         (camera(cy="8"), "camera.cy is '8', expected a finite number"),
         (camera(distortion=[1, 2]), "camera.distortion is [1, 2], expected a list of 4 or 5 numbers"),
         (camera(k1=0.1), "unknown key camera.k1"),

@@ -138,9 +138,9 @@ class Evaluate:
 
         header, evaluations = read_metrics(self.run_folder)
         try:
-            groundtruth = read_scene(Path(header["scene"])).groundtruth
-        except EbarfError:
-            # A run outlives its scene: its numbers are its own.
+            groundtruth = read_scene(Path(header.get("scene", "scene"))).groundtruth
+        except EbarfError as error:
+            _stderr.print(f"the run's scene is gone, so the report has no reference trajectory ({error})")
             groundtruth = None
         page = write_report(self.run_folder, groundtruth)
         if self.json:
@@ -174,8 +174,8 @@ def _print_json(content: dict[str, Any]) -> None:
 def _refuse_existing(output: Path) -> None:
     from ebarf_ns.errors import SceneError
 
-    if output.exists() and not (output / "scene.json").is_file() and (not output.is_dir() or any(output.iterdir())):
-        raise SceneError(f"{output}: exists and is not a scene folder, expected a new folder or a scene to replace")
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise SceneError(f"{output}: exists, expected a new folder; remove it first where it is not needed")
 
 
 def entrypoint() -> None:

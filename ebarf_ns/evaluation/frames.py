@@ -1,5 +1,6 @@
 """Validation frames as linear radiance, and how well renders match them."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -30,11 +31,13 @@ def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
 
 
 def _read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
-    if path.suffix == ".npy":
-        pixels = np.load(path, allow_pickle=False)
-    else:
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
+    # OpenCV reads EXR only when asked to; it looks here at its first image.
+    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+    try:
+        pixels = np.load(path, allow_pickle=False) if path.suffix == ".npy" else cv2.imread(str(path), -1)
+    except (cv2.error, ValueError, OSError, EOFError) as error:
+        raise EvaluationError(f"{path}: cannot be read as an image ({str(error).splitlines()[0]:.80})") from None
+    if pixels is None or pixels.ndim not in (2, 3):
         raise EvaluationError(f"{path}: cannot be read as an image")
     white = {"uint8": 255.0, "uint16": 65535.0}
     scale = white.get(pixels.dtype.name, 1.0)

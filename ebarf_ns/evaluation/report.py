@@ -85,8 +85,9 @@ def _trajectory_figure(run: Path, groundtruth: Path | None) -> Figure:
 
 def _curves_figure(evaluations: list[dict[str, Any]]) -> Figure:
     names = [name for name in _CURVES if any(record.get(name) is not None for record in evaluations)]
-    figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.2), squeeze=False)
-    for axis, name in zip(axes[0], names, strict=True):
+    count = max(1, len(names))
+    figure, axes = plt.subplots(1, count, figsize=(3.6 * count, 3.2), squeeze=False)
+    for axis, name in zip(axes[0], names, strict=False):
         points = [(record["train_seconds"], record[name]) for record in evaluations if record.get(name) is not None]
         axis.plot(*zip(*points, strict=True), marker="o", ms=4)
         axis.set(xscale="log", xlabel="training time [s]", title=_CURVES[name])

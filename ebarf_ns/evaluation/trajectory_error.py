@@ -19,6 +19,8 @@ from ebarf_ns.geometry.so3 import quat_wxyz_multiply, rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
 from ebarf_ns.geometry.trajectory_file import read_tum
 
+# Motion across the main direction below this share of that along it counts as a line.
+_THINNEST = 0.01
 Alignment = Literal["se3", "sim3", "orientation"]
 
 
@@ -50,13 +52,7 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     if alignment == "orientation":
         scale = _align_by_orientation(estimated, true, (straight * turned.inv()).mean())
     else:
-        try:
-            _, _, scale = estimated.align(true, correct_scale=alignment == "sim3")
-        except GeometryException as error:
-            raise EvaluationError(
-                f"the trajectory cannot be aligned to the reference: {error} (the {estimated.num_poses} matched "
-                "positions lie on a line or in a point; expected motion in at least 2 directions)"
-            ) from None
+        _, _, scale = _umeyama(estimated, true, correct_scale=alignment == "sim3")
     position_error, full_error = (
         _absolute_error(estimated, true, relation)
         for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.full_transformation)
@@ -69,6 +65,21 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
         scale=float(scale),
         matched=int(estimated.num_poses),
     )
+
+
+def _umeyama(estimated: PosePath3D, true: PosePath3D, correct_scale: bool) -> tuple[np.ndarray, np.ndarray, float]:
+    """Align in place; positions on a line leave the turn about it open, whatever their noise says of it."""
+    for path in (estimated, true):
+        extent = np.linalg.svd(path.positions_xyz - path.positions_xyz.mean(axis=0), compute_uv=False)
+        if extent[1] <= _THINNEST * extent[0]:
+            raise EvaluationError(
+                f"the trajectory cannot be aligned to the reference: the {path.num_poses} matched positions of one lie "
+                "on a line or in a point, expected motion in at least 2 directions"
+            )
+    try:
+        return estimated.align(true, correct_scale=correct_scale)
+    except GeometryException as error:
+        raise EvaluationError(f"the trajectory cannot be aligned to the reference: {error}") from None
 
 
 def _absolute_error(estimated: PosePath3D, true: PosePath3D, relation: metrics.PoseRelation) -> metrics.APE:
@@ -167,10 +178,7 @@ def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_
     For frames outside the estimate's span. Raises :class:`EvaluationError` where the alignment is not defined.
     """
     estimated, true = _matched(estimate, reference)
-    try:
-        rotation, shift, scale = estimated.align(true, correct_scale=True)
-    except GeometryException as error:
-        raise EvaluationError(f"the trajectory cannot be aligned to the reference: {error}") from None
+    rotation, shift, scale = _umeyama(estimated, true, correct_scale=True)
     poses = interpolate(reference.t_us, reference.poses, t_us)
     back = torch.from_numpy(Rotation.from_matrix(rotation.T).as_quat()[[3, 0, 1, 2]]).expand(len(t_us), 4)
     position = rotate(back, poses.position - torch.from_numpy(shift)) / float(scale)

@@ -15,11 +15,11 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from ebarf_ns.errors import SceneError, one_line_errors
+from ebarf_ns.errors import one_line_errors
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.scene import Frame, Scene, read_scene
+from ebarf_ns.scene import Frame, Scene, check_bounds, read_scene
 
 # Without bounds, the trajectory fills this share of the part of space that is not contracted.
 _TRAJECTORY_SHARE = 0.25
@@ -103,15 +103,9 @@ class EbarfDataParser(DataParser):
 
 
 def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:
+    check_bounds(scene, trajectory)
     if scene.bounds is not None:
         lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
-        position = trajectory.poses.position
-        outside = ((position < lower) | (position > upper)).any(dim=-1)
-        if outside.all():
-            raise SceneError(
-                f"{scene.folder / 'scene.json'}: bounds {scene.bounds} hold none of the {len(position)} keyframes of "
-                f"{scene.trajectory.name}, the first of which is at {position[0].tolist()}; expected bounds around them"
-            )
         return Normalization((lower + upper) / 2, 2 / float((upper - lower).max()))
     centre = trajectory.poses.position.mean(dim=0)
     radius = float((trajectory.poses.position - centre).norm(dim=-1).max())

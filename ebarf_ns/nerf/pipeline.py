@@ -21,7 +21,7 @@ from ebarf_ns.evaluation.trajectory_error import (
     trajectory_error,
 )
 from ebarf_ns.files import whole_file
-from ebarf_ns.geometry.trajectory import Trajectory, within_span
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras
@@ -55,6 +55,12 @@ class EbarfPipeline(VanillaPipeline):
             super().__init__(*args, **kwargs)
             if self.test_mode == "val":
                 self._check_references()
+        self.register_buffer("cost", torch.zeros(2, dtype=torch.float64))
+        self.cost: Tensor
+
+    def record_cost(self, train_seconds: float, event_pairs: int) -> None:
+        """What the model has cost so far; kept in its checkpoints, so that ns-eval can say it."""
+        self.cost.copy_(torch.tensor([train_seconds, event_pairs]))
 
     def _check_references(self) -> None:
         """Read what evaluation will need, so that a mistake in it does not end a run halfway."""
@@ -68,6 +74,10 @@ class EbarfPipeline(VanillaPipeline):
         """The scene folder."""
         return self.datamanager.train_dataset.scene
 
+    @property
+    def _normalization(self) -> Normalization:
+        return self.datamanager.train_dataset.metadata["normalization"]
+
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
         self.model.begin_step(step, self.datamanager.config.seed)
@@ -77,18 +87,17 @@ class EbarfPipeline(VanillaPipeline):
         """The keyframes, refined or as they came, in the input's world frame and scale."""
         optimizer = self.model.camera_optimizer
         keyframes = optimizer.trajectory() if refined else Trajectory(optimizer.keyframe_t_us, optimizer.initial())
-        normalization: Normalization = self.datamanager.train_dataset.metadata["normalization"]
-        world = normalization.invert(keyframes)
+        world = self._normalization.invert(keyframes)
         return Trajectory(world.t_us.cpu(), world.poses)
 
     @torch.no_grad()
-    def evaluate(self, renders: Path | None = None) -> dict[str, float | None]:
+    def evaluate(self, renders: Path | None = None) -> dict[str, Any]:
         """Held-out event loss and, where the scene has references, image and trajectory errors.
 
         With ``renders``, each frame is written there beside its reference as a PNG.
         """
         self.eval()
-        results: dict[str, float | None] = {"heldout_event_loss": self._heldout_event_loss()}
+        results: dict[str, Any] = {"heldout_event_loss": self._heldout_event_loss()}
         results |= self._image_errors(renders)
         results |= self._trajectory_errors()
         self.train()
@@ -107,15 +116,24 @@ class EbarfPipeline(VanillaPipeline):
 
     def _image_errors(self, renders: Path | None) -> dict[str, float]:
         """Frames at the refined pose of their time, and apart from them those outside the trajectory's span."""
-        dataset = self.datamanager.eval_dataset
-        by_path = {frame.path: frame for frame in self.scene.frames}
-        within = [by_path.pop(path) for path in dataset.image_filenames if path in by_path]
-        results = self._compare(within, dataset.cameras, renders) if within else {}
-        outside = list(by_path.values())
-        results |= {"frames_outside_span": float(len(outside))} if outside else {}
-        cameras = self._cameras_at_reference(outside) if outside else None
-        if cameras is not None:
-            results |= {f"{name}_outside_span": value for name, value in self._compare(outside, cameras).items()}
+        optimizer, scale = self.model.camera_optimizer, self._normalization.scale
+        keyframe_t_us = optimizer.keyframe_t_us.cpu()
+        within, outside = [], []
+        for frame in self.scene.frames:
+            inside = keyframe_t_us[0] <= frame.t_us <= keyframe_t_us[-1]
+            (within if inside else outside).append(frame)
+        results: dict[str, float] = {}
+        if within:
+            t_us = torch.tensor([frame.t_us for frame in within])
+            initial = Poses(*(column.cpu() for column in optimizer.initial()))
+            # Placed along the initial trajectory, from where the model moves them along with the refined one.
+            poses = interpolate(keyframe_t_us, initial, t_us)
+            results |= self._compare(within, frame_cameras(within, Trajectory(t_us, poses), scale), renders)
+        if outside:
+            results |= {"frames_outside_span": float(len(outside))}
+            cameras = self._cameras_at_reference(outside)
+            if cameras is not None:
+                results |= {f"{name}_outside_span": value for name, value in self._compare(outside, cameras).items()}
         return results
 
     def _cameras_at_reference(self, frames: list[Frame]) -> Cameras | None:
@@ -129,8 +147,8 @@ class EbarfPipeline(VanillaPipeline):
             poses = reference_in_estimates_world(self.trajectory(), reference, t_us)
         except EvaluationError:
             return None
-        normalization: Normalization = self.datamanager.train_dataset.metadata["normalization"]
-        cameras = frame_cameras(frames, normalization.apply(Trajectory(t_us, poses)), normalization.scale)
+        placed = self._normalization.apply(Trajectory(t_us, poses))
+        cameras = frame_cameras(frames, placed, self._normalization.scale)
         # Without their times, cameras are not moved along with the refined trajectory.
         cameras.metadata = {}
         return cameras
@@ -144,17 +162,18 @@ class EbarfPipeline(VanillaPipeline):
         references = [read_frame(frame) for frame in frames]
         if renders:
             white = max(float(image.max()) for image in references)
-            for frame, fitted, reference in zip(frames, fit_brightness(rendered, references), references, strict=True):
+            pairs = zip(fit_brightness(rendered, references), references, strict=True)
+            for k, (fitted, reference) in enumerate(pairs):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
-                with whole_file(renders / f"{frame.path.stem}.png") as temporary:
+                with whole_file(renders / f"{k:04d}.png") as temporary:
                     cv2.imwrite(str(temporary), (beside * 255).round().astype(np.uint8))
         return {**image_errors(rendered, references), "frames": float(len(frames))}
 
-    def _trajectory_errors(self) -> dict[str, float | None]:
+    def _trajectory_errors(self) -> dict[str, Any]:
         if self.scene.groundtruth is None:
             return {}
         reference, estimate = read_tum(self.scene.groundtruth), self.trajectory()
-        results: dict[str, float | None] = {}
+        results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": None, "scale": None, "ape_full": None}
         for alignment, suffix in _ALIGNMENTS.items():
             try:
                 error = trajectory_error(estimate, reference, alignment)
@@ -171,7 +190,11 @@ class EbarfPipeline(VanillaPipeline):
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
-    ) -> dict[str, float | None]:
-        """What ns-eval writes under "results"."""
+    ) -> dict[str, Any]:
+        """What ns-eval writes under "results"; numbers alone for the logs of a training."""
         with one_line_errors():
-            return self.evaluate(output_path)
+            results = self.evaluate(output_path)
+        if step is not None:
+            return {name: value for name, value in results.items() if isinstance(value, float)}
+        train_seconds, event_pairs = self.cost.tolist()
+        return {**results, "train_seconds": train_seconds, "event_pairs": int(event_pairs)}

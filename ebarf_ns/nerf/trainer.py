@@ -76,7 +76,8 @@ class GuardedOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Raises :class:`TrainingError` when too many steps in a row had to be skipped."""
         gradients = [p.grad for group in param_groups for p in self.parameters[group] if p.grad is not None]
-        if all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
+        # A gradient scaler looks for overflow itself, and lowers its scale when it finds it.
+        if grad_scaler.is_enabled() or all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
             self.skipped_in_a_row = 0
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
@@ -104,6 +105,7 @@ class EbarfTrainer(Trainer):
 
     config: EbarfTrainerConfig
     pipeline: EbarfPipeline
+    optimizers: GuardedOptimizers
 
     def setup(self, test_mode: Any = "val") -> None:
         """Build pipeline and optimizers; what a user can cause ends in one line."""
@@ -113,10 +115,14 @@ class EbarfTrainer(Trainer):
         self.field_restarted = False
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
+            for flag in ("max_num_iterations", "max_train_seconds"):
+                value = getattr(self.config, flag)
+                if value is not None and not value > 0:
+                    raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected more than 0")
             super().setup(test_mode)
             if self.progress() >= 1:
                 raise TrainingError(
-                    f"the loaded run has used its budget of {self.config.max_num_iterations} steps; "
+                    f"the loaded run has used its budget ({self.steps_done} steps, {self.train_seconds:.0f} s); "
                     "expected a larger --max-num-iterations or --max-train-seconds to go on"
                 )
 
@@ -134,10 +140,11 @@ class EbarfTrainer(Trainer):
         """Train to the end of the budget."""
         with one_line_errors():
             write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
-            self._record_metrics(self._header())
+            self._begin_metrics()
             super().train()
 
     def _after_train(self) -> None:
+        self.save_checkpoint(self.step)
         write_report(self.base_dir, self.pipeline.scene.groundtruth)
         super()._after_train()
 
@@ -155,6 +162,7 @@ class EbarfTrainer(Trainer):
         self.steps_done = step + 1
         self.train_seconds += monotonic() - started
         self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2
+        self.pipeline.record_cost(self.train_seconds, self.event_pairs)
         after = self.progress()
         if int(after * self.config.evaluations) > int(before * self.config.evaluations) or after >= 1:
             self._evaluate(step, float(result[0].detach()))
@@ -178,35 +186,45 @@ class EbarfTrainer(Trainer):
             "event_pairs": self.event_pairs,
             "loss": loss,
             **results,
-            "skipped_steps": getattr(self.optimizers, "skipped", 0),
-            "peak_memory_mib": round(_peak_memory_mib(), 1),
+            "skipped_steps": self.optimizers.skipped,
+            "peak_memory_mib": round(_peak_memory_mib(self.device), 1),
         }
         self._record_metrics(record)
         write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
-        numbers = {name: value for name, value in results.items() if value is not None}
+        numbers = {name: value for name, value in results.items() if isinstance(value, float)}
         writer.put_dict(name="Evaluation", scalar_dict=numbers, step=step)
         shown = "  ".join(f"{name} {value:.4g}" for name, value in numbers.items())
         CONSOLE.print(f"step {self.steps_done}, {self.train_seconds:.1f} s, {self.event_pairs:,} pairs:  {shown}")
 
     @check_main_thread
-    def _record_metrics(self, record: dict[str, Any]) -> None:
+    def _begin_metrics(self) -> None:
+        """Header first; a run that goes on in its own folder keeps what is there."""
         path = self.base_dir / "metrics.jsonl"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record) + "\n")
+        if self._start_step == 0 or not path.is_file():
+            with whole_file(path) as temporary:
+                temporary.write_text(json.dumps(self._header()) + "\n", encoding="utf-8")
+
+    @check_main_thread
+    def _record_metrics(self, record: dict[str, Any]) -> None:
+        finite = {key: None if value != value else value for key, value in record.items()}
+        with (self.base_dir / "metrics.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(finite) + "\n")
 
     def _header(self) -> dict[str, Any]:
         device = torch.cuda.get_device_name() if self.device.startswith("cuda") else platform.processor() or "cpu"
         scene = self.pipeline.scene
+        # What says where a run lies, not what it does.
+        places = {"timestamp", "output_dir", "experiment_name", "load_dir", "load_step", "load_checkpoint", "data"}
+        configuration = {key: value for key, value in asdict(self.config).items() if key not in places}
         return {
             "versions": {name: version(name) for name in ("ebarf_ns", "nerfstudio", "torch", "numpy")},
             "method": self.config.method_name,
             "device": device,
             "threads": torch.get_num_threads(),
             "seed": self.config.machine.seed,
-            "scene": str(scene.folder),
+            "scene": str(scene.folder.resolve()),
             "scene_digest": _digest((scene.folder / "scene.json").read_bytes() + scene.trajectory.read_bytes()),
-            "config_digest": _digest(yaml.dump(asdict(self.config)).encode()),
+            "config_digest": _digest(yaml.dump(configuration).encode()),
         }
 
     @check_main_thread
@@ -225,6 +243,7 @@ class EbarfTrainer(Trainer):
                 "train_seconds": self.train_seconds,
                 "event_pairs": self.event_pairs,
                 "field_restarted": self.field_restarted,
+                "skipped_steps": self.optimizers.skipped,
             },
         }
         # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
@@ -241,8 +260,11 @@ class EbarfTrainer(Trainer):
         path = self._loaded_path()
         if path is not None:
             state = torch.load(path, map_location="cpu")
-            for name, value in state.get("ebarf", {}).items():
-                setattr(self, name, value)
+            ours = state.get("ebarf", {})
+            self.train_seconds = ours.get("train_seconds", 0.0)
+            self.event_pairs = ours.get("event_pairs", 0)
+            self.field_restarted = ours.get("field_restarted", False)
+            self.optimizers.skipped = ours.get("skipped_steps", 0)
             self.steps_done = self._start_step
 
     def _loaded_path(self) -> Path | None:
@@ -253,8 +275,8 @@ class EbarfTrainer(Trainer):
         return self.config.load_checkpoint
 
 
-def _peak_memory_mib() -> float:
-    if torch.cuda.is_available():
+def _peak_memory_mib(device: str) -> float:
+    if device.startswith("cuda"):
         return torch.cuda.max_memory_allocated() / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 

@@ -19,6 +19,7 @@ from ebarf_ns.simulation.motion import HandheldMotion, perturb, sample_trajector
 from ebarf_ns.simulation.room import Room
 from ebarf_ns.simulation.sensor import EventSensor
 
+_LARGEST = 1e5
 _PIXELS_PER_STEP = 1 / 3
 _MARGIN_M = 0.2
 _SUBPIXELS = (-0.25, 0.25)
@@ -48,8 +49,9 @@ class Simulation:
 def simulate(settings: Simulation, folder: Path, progress: Callable[[float], None] = lambda fraction: None) -> Scene:
     """Write a scene folder; raises :class:`SimulationError` for settings that describe no scene."""
     for name in ("duration_s", "width", "height", "focal_px", "threshold_on", "threshold_off", "keyframe_rate_hz"):
-        if not getattr(settings, name) > 0:
-            raise SimulationError(f"{name} is {getattr(settings, name)}, expected a value above 0")
+        value = getattr(settings, name)
+        if not 0 < value < _LARGEST:
+            raise SimulationError(f"{name} is {value}, expected a value above 0 and below {_LARGEST:g}")
     room, motion = Room(seed=settings.seed), HandheldMotion(seed=settings.seed)
     camera = Camera(
         "pinhole", settings.width, settings.height, settings.focal_px, settings.focal_px,
@@ -61,6 +63,11 @@ def simulate(settings: Simulation, folder: Path, progress: Callable[[float], Non
             f"{settings.duration_s} s at {settings.keyframe_rate_hz} Hz is fewer than 2 keyframes, expected 2 or more"
         )
     recording = _record(room, motion, camera, settings, end_us, progress)
+    if not len(recording):
+        raise SimulationError(
+            f"no event in {settings.duration_s} s at thresholds {settings.threshold_on} and {settings.threshold_off}, "
+            "expected lower thresholds or a longer duration"
+        )
     keyframes = sample_trajectory(motion, _times_us(end_us, settings.keyframe_rate_hz))
     with whole_folder(folder) as temporary:
         write_recording(temporary / "events.h5", recording)

@@ -62,12 +62,12 @@ def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):
     assert "data:image/png;base64," in page and "<svg" in page and "http" not in page.split("</style>")[0]
 
 
-def test_simulate_with_a_knob_and_replacing_an_older_scene(tmp_path: Path):
+def test_simulate_with_a_knob(tmp_path: Path):
     short = ["--width=16", "--height=12", "--duration-s=0.2", "--focal-px=14"]
     run_ok("ebarf", "simulate", tmp_path / "scene", *short)
     few = json.loads(run_ok("ebarf", "inspect", tmp_path / "scene", "--json"))["events"]
-    run_ok("ebarf", "simulate", tmp_path / "scene", *short, "--threshold-on=0.1", "--threshold-off=0.1")
-    many = json.loads(run_ok("ebarf", "inspect", tmp_path / "scene", "--json"))["events"]
+    run_ok("ebarf", "simulate", tmp_path / "fine", *short, "--threshold-on=0.1", "--threshold-off=0.1")
+    many = json.loads(run_ok("ebarf", "inspect", tmp_path / "fine", "--json"))["events"]
     assert many > 1.8 * few > 0
 
 
@@ -118,10 +118,10 @@ def test_bad_source_is_one_line_exit_2_and_no_output(tmp_path: Path, files: dict
     assert finished.errors.count("\n") == 1 and [path.name for path in tmp_path.iterdir()] == ["raw"]
 
 
-def test_a_folder_that_is_no_scene_is_never_replaced(tmp_path: Path):
+def test_a_folder_with_something_in_it_is_never_replaced(tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("years of work")
     finished = run_command("ebarf", "simulate", tmp_path)
-    assert finished.code == 2 and "is not a scene folder" in finished.errors and (tmp_path / "thesis.tex").exists()
+    assert finished.code == 2 and "expected a new folder" in finished.errors and (tmp_path / "thesis.tex").exists()
 
 
 def test_evaluate_of_no_run_is_one_line(tmp_path: Path):

@@ -95,6 +95,8 @@ def test_eval(trained_run: Path, tmp_path: Path):
     recorded = json.loads((trained_run / "metrics.jsonl").read_text().splitlines()[-1])
     for name in ("psnr", "ssim", "heldout_event_loss", "ate_m", "rotation_deg"):
         assert results[name] == pytest.approx(recorded[name], rel=1e-3)
+    assert results["alignment"] == "sim3"
+    assert results["event_pairs"] == recorded["event_pairs"] and results["train_seconds"] > 0
     assert len(list(tmp_path.glob("*.png"))) == 3
 
 

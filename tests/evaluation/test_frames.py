@@ -35,13 +35,21 @@ def test_intensity_says_how_to_get_to_linear(tmp_path: Path):
     assert np.allclose(read_frame(frame(tmp_path / "srgb.npy", "srgb")), picture(), rtol=1e-6)
 
 
+def test_exr_is_read(tmp_path: Path):
+    cv2.imwrite(str(tmp_path / "a.exr"), (5 * picture()).astype(np.float32))
+    assert np.allclose(read_frame(frame(tmp_path / "a.exr")), 5 * picture(), rtol=1e-3)
+
+
 def test_wrong_size_or_no_image_is_named(tmp_path: Path):
     np.save(tmp_path / "small.npy", np.zeros((3, 4)))
     with pytest.raises(EvaluationError, match=r"4x3 pixels, expected the camera's 32x24"):
         read_frame(frame(tmp_path / "small.npy"))
     (tmp_path / "a.png").write_text("no image")
-    with pytest.raises(EvaluationError, match="cannot be read"):
-        read_frame(frame(tmp_path / "a.png"))
+    (tmp_path / "a.npy").write_text("no array")
+    (tmp_path / "a.exr").write_text("no image")
+    for name in ("a.png", "a.npy", "a.exr"):
+        with pytest.raises(EvaluationError, match="cannot be read"):
+            read_frame(frame(tmp_path / name))
 
 
 def test_gain_and_offset_of_log_brightness_are_no_error():

@@ -48,6 +48,8 @@ def test_any_events_read_back(tmp_path_factory: pytest.TempPathFactory, events: 
         ("0.2 -1 2 1", "is not an event"),
         ("0.2.1 1 2 1", "is not an event"),
         ("nan 1 2 1", "is not an event"),
+        (". 1 2 1", "is not an event"),
+        ("-. 1 2 1", "is not an event"),
         ("0.2 one 2 1", "is not an event"),
         ("12345678901234567890 1 2 1", "is not an event"),
         ("0.2 240 2 1", "x is 240, expected 0 to 239"),

@@ -57,7 +57,9 @@ def test_negative_times_are_written_right():
         ("0.2 0 0 0 0 0 0 1.1", "has length 1.1, expected 1"),
         (f"0.1 {IDENTITY}", ":2: timestamp 0.1 is not after the one before it (100000 us)"),
         (f"0.05 {IDENTITY}", ":2: timestamp 0.05 is not after"),
-        (f"1e30 {IDENTITY}", "does not fit 64-bit microseconds"),
+        (f"1e20 {IDENTITY}", "does not fit 64-bit microseconds"),
+        (f"1e999999 {IDENTITY}", "timestamp is 1e999999, expected a"),
+        ("0.2 1e400 0 0 0 0 0 1", "tx is 1e400, expected a finite number"),
     ],
 )
 def test_bad_line_is_named(tmp_path: Path, line: str, words: str):

@@ -39,7 +39,8 @@ def trainer(made: EbarfTrainerConfig) -> EbarfTrainer:
 
 
 def state(ready: EbarfTrainer) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in ready.pipeline.state_dict().items()}
+    """Everything a checkpoint holds of the pipeline but what it cost."""
+    return {name: value.clone() for name, value in ready.pipeline.state_dict().items() if name != "cost"}
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -122,7 +123,37 @@ def test_a_used_up_budget_is_said_in_one_line(tiny_scene: Path, tmp_path: Path, 
     made.load_dir = done.checkpoint_dir
     with pytest.raises(SystemExit) as stopped:
         trainer(made)
-    assert stopped.value.code == 2 and "expected a larger --max-num-iterations" in capsys.readouterr().err
+    assert stopped.value.code == 2 and "has used its budget (12 steps" in capsys.readouterr().err
+
+
+def test_training_twice_into_one_folder_leaves_one_record(tiny_scene: Path, tmp_path: Path):
+    for _ in range(2):
+        trainer(config(tiny_scene, tmp_path, steps=4)).train()
+    lines = [json.loads(line) for line in (tmp_path / "x" / "ebarf" / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert ["versions" in line for line in lines] == [True, False, False]
+
+
+def test_a_recording_too_short_to_hold_anything_back_still_trains(tiny_scene: Path, tmp_path: Path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    content = json.loads((scene / "scene.json").read_text())
+    (scene / "scene.json").write_text(json.dumps({**content, "frames": None, "groundtruth": None}))
+    made = config(scene, tmp_path, steps=4)
+    made.pipeline.datamanager.heldout_share = 0.0  # pyright: ignore[reportAttributeAccessIssue]
+    trainer(made).train()
+    run = tmp_path / "x" / "ebarf" / "run"
+    assert json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["heldout_event_loss"] is None
+    assert (run / "report" / "report.html").is_file() and list((run / "nerfstudio_models").iterdir())
+
+
+@pytest.mark.parametrize(("flag", "value"), [("max_num_iterations", 0), ("max_train_seconds", -1.0)])
+def test_no_budget_is_an_error(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str, value: float
+):
+    made = config(tiny_scene, tmp_path)
+    setattr(made, flag, value)
+    with pytest.raises(SystemExit):
+        trainer(made)
+    assert f"--{flag.replace('_', '-')} is {value}, expected more than 0" in capsys.readouterr().err
 
 
 def test_a_step_with_a_broken_gradient_changes_nothing(tiny_scene: Path, tmp_path: Path):

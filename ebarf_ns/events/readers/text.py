@@ -99,6 +99,7 @@ def _number(content, i, decimals):
     negative = content[i] == 45  # '-'
     i += 1 if negative else 0
     value, digits, after_point, round_up = 0, 0, -1, False
+    start = i
     while i < len(content):
         c = content[i]
         if c == 46 and after_point < 0 and decimals > 0:  # '.'
@@ -114,11 +115,12 @@ def _number(content, i, decimals):
         else:
             break
         i += 1
+    read_any = i - start > (1 if after_point >= 0 else 0)
     for _ in range(max(after_point, 0), decimals):
         value *= 10
         digits += 1
     value += 1 if round_up else 0
     separated = i == len(content) or content[i] in (32, 9, 10, 13, 44, 35)
-    ok = digits > (decimals if after_point < 0 else 0) and digits <= _LONGEST_NUMBER and separated
+    ok = read_any and digits <= _LONGEST_NUMBER and separated
     # Coordinates and polarities are never negative; times may be.
     return (-value if negative else value), i, ok and (decimals > 0 or not negative)
