@@ -19,7 +19,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 def main(run: Path, groundtruth: Path, frame: str, output: Path) -> None:
     """Draw and save."""
     picture = cv2.imread(str(run / "renders" / f"{frame}.png"))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 3.4), width_ratios=[2.6, 1])
+    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 3.2), width_ratios=[2.4, 1])
     left.imshow(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
     left.axis("off")
     truth = read_tum(groundtruth)
@@ -40,7 +40,7 @@ def main(run: Path, groundtruth: Path, frame: str, output: Path) -> None:
         line[0].set_label("true" if axis == 0 else "")
     right.set(xlabel="time [s]", ylabel="x, y, z [cm]")
     right.legend(fontsize=8)
-    figure.tight_layout()
+    figure.tight_layout(pad=0.3)
     figure.savefig(output, dpi=80)
 
 
