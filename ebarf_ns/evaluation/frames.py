@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from ebarf_ns.errors import EvaluationError
 from ebarf_ns.scene import Frame
@@ -67,6 +66,8 @@ def image_errors(
     rendered_log: list[Float[np.ndarray, "height width"]], reference: list[Float[np.ndarray, "height width"]]
 ) -> dict[str, float]:
     """Mean PSNR and SSIM of log-brightness renders against linear references, on [0, 1] after the joint fit."""
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
     white = max(float(image.max()) for image in reference)
     psnr, ssim = [], []
     for fitted, truth in zip(fit_brightness(rendered_log, reference), reference, strict=True):

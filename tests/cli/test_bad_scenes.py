@@ -80,7 +80,7 @@ ONLY_TRAINING = {
 }
 
 
-TRAINING = ["wrong key", "unsorted", "one keyframe", "bounds elsewhere", "frame of another size", *ONLY_TRAINING]
+TRAINING = ["unsorted", "bounds elsewhere", "frame of another size", *ONLY_TRAINING]
 
 
 @pytest.fixture
