@@ -7,11 +7,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
 from ebarf_ns.events.recording import Recording, read_recording
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.scene import Scene, check_bounds, read_scene
+from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
 _HOT_RATIO = 50
 _FEW_EVENTS_PER_PIXEL = 5
@@ -56,6 +57,10 @@ def inspect_scene(folder: Path) -> Summary:
     for frame in scene.frames:
         read_frame(frame)
     summary = _summarize(scene, recording, trajectory)
+    try:
+        check_clocks(scene, recording.t_us, trajectory)
+    except SceneError as error:
+        summary.suspicions.append(str(error))
     summary.suspicions.extend(_suspicions(scene, summary, trajectory))
     return summary
 
@@ -97,11 +102,7 @@ def _summarize(scene: Scene, recording: Recording, trajectory: Trajectory) -> Su
 def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[str]:
     found = []
     outside = summary.events - summary.events_within_trajectory
-    if not summary.events_within_trajectory:
-        found.append(
-            "no event lies within the trajectory's span: are both on the same clock, the trajectory in seconds?"
-        )
-    elif outside > 0.05 * summary.events:
+    if 0 < summary.events_within_trajectory and outside > 0.05 * summary.events:
         found.append(f"{outside / summary.events:.0%} of the events lie outside the trajectory's span and are left out")
     if not 0.35 < summary.brighter_share < 0.65:
         found.append(

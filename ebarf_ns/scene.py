@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Int64
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.files import whole_file
@@ -16,6 +17,8 @@ from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
 from ebarf_ns.geometry.trajectory import Trajectory
 
 FORMAT, VERSION = "ebarf-scene", 1
+# A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
+_LONGEST_SPAN_RATIO = 100
 FrameIntensity = Literal["linear", "srgb", "log"]
 
 
@@ -91,6 +94,24 @@ def check_bounds(scene: Scene, trajectory: Trajectory) -> None:
         raise SceneError(
             f"{scene.folder / 'scene.json'}: bounds {scene.bounds} hold none of the {len(position)} keyframes of "
             f"{scene.trajectory.name}, the first of which is at {position[0].tolist()}; expected bounds around them"
+        )
+
+
+def check_clocks(scene: Scene, event_t_us: Int64[np.ndarray, "events"], trajectory: Trajectory) -> None:
+    """Raise :class:`SceneError` when events and trajectory cannot be on one clock, in one unit of time."""
+    keyframe_t_us = trajectory.t_us.numpy()
+    (start_us, end_us), (first_us, last_us) = event_t_us[[0, -1]].tolist(), keyframe_t_us[[0, -1]].tolist()
+    among = int(((keyframe_t_us >= start_us) & (keyframe_t_us <= end_us)).sum())
+    expected = f"expected {scene.trajectory.name} to be in seconds on the clock of the events"
+    if not ((event_t_us >= first_us) & (event_t_us <= last_us)).any():
+        raise SceneError(
+            f"{scene.events}: none of the {len(event_t_us):,} events, {start_us} to {end_us} us, lies within the span "
+            f"of {scene.trajectory.name}, {first_us} to {last_us} us; {expected}"
+        )
+    if among < 2 and last_us - first_us > _LONGEST_SPAN_RATIO * max(end_us - start_us, 1):
+        raise SceneError(
+            f"{scene.trajectory}: spans {last_us - first_us} us with {among} keyframes among the events, which span "
+            f"{end_us - start_us} us; {expected}"
         )
 
 

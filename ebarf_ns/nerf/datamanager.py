@@ -28,7 +28,7 @@ from ebarf_ns.events.pairs import (
 from ebarf_ns.events.recording import Recording, read_recording
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
-from ebarf_ns.scene import Scene
+from ebarf_ns.scene import Scene, check_clocks
 
 _HELDOUT_SEED = 1 << 32
 _LONGEST_HELDOUT_PAIR = 30
@@ -117,13 +117,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         keyframes: Trajectory = self.train_dataset.metadata["keyframes"]
         start_us, end_us = int(keyframes.t_us[0]), int(keyframes.t_us[-1])
         whole = read_recording(scene.events, scene.camera.width, scene.camera.height)
+        check_clocks(scene, whole.t_us, self.train_dataset.metadata["trajectory"])
         recording = whole.between(start_us, end_us)
-        if not len(recording):
-            raise RecordingError(
-                f"{scene.events}: none of the {len(whole):,} events, {whole.t_us[0]} to {whole.t_us[-1]} us, lies "
-                f"within the span of {scene.trajectory.name}, {start_us} to {end_us} us; expected the same clock and, "
-                "in the trajectory, seconds"
-            )
         if len(recording) < len(whole):
             CONSOLE.print(
                 f"left out {len(whole) - len(recording):,} of {len(whole):,} events, outside the trajectory's span"

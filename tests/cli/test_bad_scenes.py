@@ -76,7 +76,7 @@ CASES = {
 }
 ONLY_TRAINING = {
     "another clock": (edit_trajectory(lambda lines: [f"7{line}" for line in lines]), "none of the"),
-    "milliseconds": (edit_trajectory(scaled_times(1e6)), "expected the same clock and, in the trajectory, seconds"),
+    "milliseconds": (edit_trajectory(scaled_times(1e3)), "expected trajectory.txt to be in seconds on the clock"),
 }
 
 
@@ -95,6 +95,14 @@ def test_inspect_says_what_is_wrong(scene: Path, case: str):
     finished = run_command("ebarf", "inspect", scene)
     assert finished.code == 2 and finished.output == "" and words in finished.errors
     assert finished.errors.startswith("error: ") and finished.errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("case", ONLY_TRAINING)
+def test_inspect_suspects_the_clocks(scene: Path, case: str):
+    spoil, words = ONLY_TRAINING[case]
+    spoil(scene)
+    finished = run_command("ebarf", "inspect", scene)
+    assert finished.code == 0 and words in " ".join(finished.output.split())
 
 
 @pytest.mark.parametrize("case", TRAINING)
