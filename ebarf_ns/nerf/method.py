@@ -1,5 +1,7 @@
 """The methods that ns-train offers: ebarf, and as yardsticks ebarf-paper and enerf."""
 
+from typing import Literal
+
 import torch
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -47,9 +49,10 @@ def _trainer(
     )
 
 
-def _paper_model(mode: str) -> EbarfModelConfig:
-    return EbarfModelConfig(
-        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False),  # pyright: ignore[reportArgumentType]
+def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConfig:
+    """The seed paper's method; its baseline is the same with the poses frozen."""
+    model = EbarfModelConfig(
+        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False),
         loss="normalized",
         brightness="lin_log",
         intensity_range="unit",
@@ -61,6 +64,7 @@ def _paper_model(mode: str) -> EbarfModelConfig:
         grid_coarsest=16,
         grid_finest=512,
     )
+    return _trainer(method_name, EventDataManagerConfig(longest_pair=1), model, field_rate=5e-3, pose_rate_px=0.1)
 
 
 ebarf = MethodSpecification(
@@ -76,23 +80,11 @@ ebarf = MethodSpecification(
 )
 
 ebarf_paper = MethodSpecification(
-    config=_trainer(
-        "ebarf-paper",
-        EventDataManagerConfig(longest_pair=1),
-        _paper_model("refine"),
-        field_rate=5e-3,
-        pose_rate_px=0.1,
-    ),
+    config=_paper("ebarf-paper", "refine"),
     description="E-BARF as published: consecutive event pairs, uniform samples, normalised loss.",
 )
 
 enerf = MethodSpecification(
-    config=_trainer(
-        "enerf",
-        EventDataManagerConfig(longest_pair=1),
-        _paper_model("off"),
-        field_rate=5e-3,
-        pose_rate_px=0.1,
-    ),
+    config=_paper("enerf", "off"),
     description="E-NeRF: ebarf-paper with the poses frozen.",
 )
