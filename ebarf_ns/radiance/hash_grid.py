@@ -1,20 +1,25 @@
 """Multi-resolution hash encoding (Müller et al. 2022, Instant Neural Graphics Primitives) with position gradients.
 
-One set of formulas, two carriers: a plain torch implementation that runs anywhere and serves as reference, and numba
-kernels for CPU that make no temporaries per corner and need no atomics, because each thread owns whole levels.
+One lattice and one table, and four ways to carry the encoding out: numba kernels on a CPU, Triton kernels on a GPU,
+tiny-cuda-nn where it is importable, and plain torch, which runs anywhere and is what the others are tested against.
+The lattice and the table's order are tiny-cuda-nn's, so that a trained table means the same to all of them.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
 from dataclasses import dataclass
-from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
-from numba import njit, prange
 from torch import Tensor, nn
 
-_PRIMES = (1, 2654435761, 805459861)
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+Carrier = Literal["numba", "triton", "tcnn", "torch"]
+PRIMES = (1, 2654435761, 805459861)
 
 
 @dataclass(frozen=True)
@@ -25,191 +30,150 @@ class HashGridShape:
     features: int = 4
     coarsest: int = 8
     finest: int = 192
-    table_size_log2: int = 15
+    table_size_log2: int = 17
+
+    @property
+    def growth(self) -> float:
+        """Ratio of neighbouring resolutions; a hair less than asked, so that rounding cannot add a vertex."""
+        return ((self.finest - 0.1) / self.coarsest) ** (1 / max(self.levels - 1, 1))
+
+    @property
+    def scales(self) -> list[float]:
+        """Cells of each level between its first and last vertex."""
+        return [self.coarsest * self.growth**level - 1 for level in range(self.levels)]
 
     @property
     def resolutions(self) -> list[int]:
-        """Cells per side of each level."""
-        growth = (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))
-        return [round(self.coarsest * growth**level) for level in range(self.levels)]
+        """Vertices per side of each level."""
+        return [int(np.ceil(scale)) + 1 for scale in self.scales]
 
     @property
     def rows(self) -> list[int]:
-        """Table rows of each level."""
-        return [min((resolution + 1) ** 3, 1 << self.table_size_log2) for resolution in self.resolutions]
+        """Table rows of each level, a multiple of 8."""
+        return [min(-(-(resolution**3) // 8) * 8, 1 << self.table_size_log2) for resolution in self.resolutions]
+
+    @property
+    def width(self) -> int:
+        """Number of features over all levels."""
+        return self.levels * self.features
+
+    @property
+    def reach(self) -> float:
+        """Share of tiny-cuda-nn's cube in which every cell has both its vertices: [0, 1] is mapped to [0, reach]."""
+        return (self.coarsest - 1.5) / (self.coarsest - 1)
+
+
+class Lattice(nn.Module):
+    """What the kernels need to know of the levels, as tensors that move with the module."""
+
+    def __init__(self, shape: HashGridShape):
+        super().__init__()
+        self.register_buffer("stretch", torch.tensor(shape.scales).float() * shape.reach, persistent=False)
+        self.register_buffer("resolution", torch.tensor(shape.resolutions), persistent=False)
+        self.register_buffer("first_row", torch.tensor([0, *np.cumsum(shape.rows)]), persistent=False)
+        self.register_buffer("level_weight", torch.ones(shape.levels), persistent=False)
+        self.stretch: Tensor
+        """Cells of each level across the unit cube, float32 of the levels."""
+        self.resolution: Tensor
+        """Vertices per side, int64 of the levels."""
+        self.first_row: Tensor
+        """Where each level begins in the table, int64 of the levels and one more."""
+        self.level_weight: Tensor
+        """What each level's features are multiplied by; a level of weight 0 costs nothing."""
 
 
 class HashGrid(nn.Module):
     """Features of points in the unit cube, trilinear between the vertices of every level."""
 
-    def __init__(self, shape: HashGridShape):
+    def __init__(self, shape: HashGridShape, carrier: Carrier | None = None):
         super().__init__()
         self.shape = shape
+        self.carrier: Carrier | None = carrier
+        self.lattice = Lattice(shape)
         self.table = nn.Parameter(torch.empty(sum(shape.rows), shape.features))
-        self.register_buffer("resolution", torch.tensor(shape.resolutions), persistent=False)
-        self.register_buffer("first_row", torch.tensor([0, *np.cumsum(shape.rows)]), persistent=False)
-        self.resolution: Int64[Tensor, "levels"]
-        self.first_row: Int64[Tensor, "levels+1"]
         self.reset()
 
     def reset(self) -> None:
         """Draw the table anew, uniform in ±1e-4."""
         nn.init.uniform_(self.table, -1e-4, 1e-4)
 
-    @property
-    def width(self) -> int:
-        """Number of features over all levels."""
-        return self.shape.levels * self.shape.features
+    def open_levels(self, count: float) -> None:
+        """Let the first ``count`` levels in, the last of them by its fraction, smoothly (BARF, Lin et al. 2021)."""
+        open_share = (count - torch.arange(self.shape.levels)).clamp(0, 1)
+        self.lattice.level_weight.copy_((1 - torch.cos(torch.pi * open_share)) / 2)
 
     def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
         """Features of points in [0, 1]³ (points outside are moved to the nearest face)."""
-        if point.device.type == "cpu" and point.dtype == torch.float32:
-            encoded: Tensor = _NumbaEncoding.apply(point, self.table, self.resolution, self.first_row)  # pyright: ignore[reportAssignmentType]
-            return encoded
-        return encode_reference(point, self.table, self.resolution, self.first_row)
+        carrier = self.carrier or fastest_carrier(point)
+        if carrier == "numba":
+            from ebarf_ns.radiance.hash_grid_numba import encode
+        elif carrier == "triton":
+            from ebarf_ns.radiance.hash_grid_triton import encode
+        elif carrier == "tcnn":
+            return self._encode_tcnn(point)
+        else:
+            encode = encode_reference
+        return encode(point, self.table, self.lattice)
+
+    def _encode_tcnn(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
+        """Through tiny-cuda-nn's own encoding, with our table in the place of its parameters."""
+        encoding = _tcnn_encoding(self.shape)
+        inside = point.clamp(0, 1) * self.shape.reach
+        encoded = torch.func.functional_call(encoding, {"params": self.table.flatten()}, (inside,))
+        return encoded * self.lattice.level_weight.repeat_interleave(self.shape.features)
+
+
+def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
+    """What to encode with: by device, precision, and what is importable."""
+    if point.dtype == torch.float32 and point.device.type == "cpu":
+        return "numba"
+    if point.dtype == torch.float32 and point.is_cuda:
+        return "tcnn" if find_spec("tinycudann") else "triton" if find_spec("triton") else "torch"
+    return "torch"
+
+
+_encodings: dict[HashGridShape, nn.Module] = {}
+
+
+def _tcnn_encoding(shape: HashGridShape) -> nn.Module:
+    """One for each shape: its own parameters are never used."""
+    if shape not in _encodings:
+        import tinycudann  # pyright: ignore[reportMissingImports]
+
+        configuration = {
+            "otype": "HashGrid",
+            "n_levels": shape.levels,
+            "n_features_per_level": shape.features,
+            "log2_hashmap_size": shape.table_size_log2,
+            "base_resolution": shape.coarsest,
+            "per_level_scale": shape.growth,
+        }
+        _encodings[shape] = tinycudann.Encoding(3, configuration, dtype=torch.float32)
+    return _encodings[shape]
 
 
 def encode_reference(
-    point: Float[Tensor, "points 3"],
-    table: Float[Tensor, "rows features"],
-    resolution: Int64[Tensor, "levels"],
-    first_row: Int64[Tensor, "levels+1"],
+    point: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], lattice: Lattice
 ) -> Float[Tensor, "points width"]:
     """The encoding in plain torch, differentiable in table and points, any device and precision."""
     levels = []
-    for cells, start, end in zip(resolution.tolist(), first_row[:-1].tolist(), first_row[1:].tolist(), strict=True):
-        scaled = point.clamp(0, 1) * cells
-        cell = scaled.detach().floor().clamp(0, cells - 1)
-        fraction, cell = scaled - cell, cell.long()
+    first_row = lattice.first_row.tolist()
+    for level, vertices in enumerate(lattice.resolution.tolist()):
+        start, end = first_row[level], first_row[level + 1]
+        place = point.clamp(0, 1) * lattice.stretch[level].to(point) + 0.5
+        cell = place.detach().floor().clamp(max=vertices - 2)
+        fraction, cell = place - cell, cell.long()
         total = torch.zeros(len(point), table.shape[1], dtype=point.dtype, device=point.device)
         for corner in range(8):
             offset = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2], device=point.device)
             weight = torch.where(offset > 0, fraction, 1 - fraction).prod(dim=-1, keepdim=True)
-            total = total + weight * table[start + _row(cell + offset, cells, end - start)].to(point.dtype)
-        levels.append(total)
+            total = total + weight * table[start + _row(cell + offset, vertices, end - start)].to(point.dtype)
+        levels.append(total * lattice.level_weight[level])
     return torch.cat(levels, dim=-1)
 
 
-def _row(vertex: Int64[Tensor, "points 3"], cells: int, rows: int) -> Int64[Tensor, "points"]:
+def _row(vertex: Tensor, vertices: int, rows: int) -> Tensor:
     x, y, z = vertex.unbind(-1)
-    if (cells + 1) ** 3 <= rows:
-        return x + (cells + 1) * (y + (cells + 1) * z)
-    return (x * _PRIMES[0] ^ y * _PRIMES[1] ^ z * _PRIMES[2]) % rows
-
-
-class _NumbaEncoding(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, point: Tensor, table: Tensor, resolution: Tensor, first_row: Tensor) -> Tensor:
-        ctx.save_for_backward(point, table, resolution, first_row)
-        encoded = torch.empty(len(point), len(resolution) * table.shape[1])
-        arguments = (point.detach().contiguous(), table.detach(), resolution, first_row, encoded)
-        _kernels(table.shape[1])[0](*(tensor.numpy() for tensor in arguments))
-        return encoded
-
-    @staticmethod
-    def backward(ctx, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None, None]:
-        point, table, resolution, first_row = ctx.saved_tensors
-        table_gradient = torch.zeros_like(table)
-        # Each level adds to a plane of its own, so that levels can run in parallel.
-        point_gradient = torch.zeros(len(resolution), len(point) if ctx.needs_input_grad[0] else 0, 3)
-        arguments = (point.detach().contiguous(), table.detach(), resolution, first_row, gradients[0].contiguous())
-        outputs = (table_gradient, point_gradient)
-        _kernels(table.shape[1])[1](*(tensor.numpy() for tensor in arguments + outputs))
-        return point_gradient.sum(0) if ctx.needs_input_grad[0] else None, table_gradient, None, None
-
-
-_BLOCK = 2048  # points whose features stay in cache while all levels are visited
-
-
-@njit(cache=True, inline="always")
-def _cell(coordinate, cells):
-    """Cell number along one axis and the place in it, points outside moved to the face."""
-    scaled = min(max(coordinate, np.float32(0)), np.float32(1)) * np.float32(cells)
-    cell = min(np.int32(scaled), cells - 1)
-    return cell, scaled - np.float32(cell)
-
-
-@njit(cache=True, inline="always")
-def _corner_terms(ix, iy, iz, cells, dense):
-    """Per axis, what the lower and the upper vertex contribute to the row: summed when dense, else combined by xor."""
-    if dense:
-        n = cells + 1
-        return (
-            np.uint32(ix), np.uint32(ix + 1), np.uint32(n * iy), np.uint32(n * (iy + 1)),
-            np.uint32(n * n * iz), np.uint32(n * n * (iz + 1)),
-        )  # fmt: skip
-    p1, p2 = np.uint32(2654435761), np.uint32(805459861)
-    return (
-        np.uint32(ix), np.uint32(ix + 1), np.uint32(iy) * p1, np.uint32(iy + 1) * p1,
-        np.uint32(iz) * p2, np.uint32(iz + 1) * p2,
-    )  # fmt: skip
-
-
-@lru_cache
-def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Forward and backward kernels for a number of features a level, which the compiler unrolls."""
-
-    @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-    def encode(point, table, resolution, first_row, encoded):
-        for block in prange((len(point) + _BLOCK - 1) // _BLOCK):
-            for level in range(len(resolution)):
-                cells = resolution[level]
-                start, rows = first_row[level], first_row[level + 1] - first_row[level]
-                dense = (cells + 1) ** 3 <= rows
-                mask = np.uint32(rows - 1)
-                for i in range(block * _BLOCK, min(len(point), (block + 1) * _BLOCK)):
-                    ix, fx = _cell(point[i, 0], cells)
-                    iy, fy = _cell(point[i, 1], cells)
-                    iz, fz = _cell(point[i, 2], cells)
-                    x0, x1, y0, y1, z0, z1 = _corner_terms(ix, iy, iz, cells, dense)
-                    for f in range(features):
-                        encoded[i, level * features + f] = 0
-                    for corner in range(8):
-                        cx, wx = (x1, fx) if corner & 1 else (x0, 1 - fx)
-                        cy, wy = (y1, fy) if corner & 2 else (y0, 1 - fy)
-                        cz, wz = (z1, fz) if corner & 4 else (z0, 1 - fz)
-                        row = start + np.int64((cx + cy + cz) if dense else ((cx ^ cy ^ cz) & mask))
-                        weight = wx * wy * wz
-                        for f in range(features):
-                            encoded[i, level * features + f] += weight * table[row, f]
-
-    @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-    def encode_backward(point, table, resolution, first_row, gradient, table_gradient, point_gradient):
-        with_points = point_gradient.shape[1] > 0
-        levels = len(resolution)
-        for k in prange(levels):
-            # Threads take runs of k: alternate ends, so that each gets cheap coarse and costly fine levels.
-            level = k // 2 if k % 2 == 0 else levels - 1 - k // 2
-            cells = resolution[level]
-            start, rows = first_row[level], first_row[level + 1] - first_row[level]
-            dense = (cells + 1) ** 3 <= rows
-            mask = np.uint32(rows - 1)
-            for i in range(len(point)):
-                ix, fx = _cell(point[i, 0], cells)
-                iy, fy = _cell(point[i, 1], cells)
-                iz, fz = _cell(point[i, 2], cells)
-                x0, x1, y0, y1, z0, z1 = _corner_terms(ix, iy, iz, cells, dense)
-                gx, gy, gz = np.float32(0), np.float32(0), np.float32(0)
-                for corner in range(8):
-                    cx, wx, sx = (x1, fx, np.float32(1)) if corner & 1 else (x0, 1 - fx, np.float32(-1))
-                    cy, wy, sy = (y1, fy, np.float32(1)) if corner & 2 else (y0, 1 - fy, np.float32(-1))
-                    cz, wz, sz = (z1, fz, np.float32(1)) if corner & 4 else (z0, 1 - fz, np.float32(-1))
-                    row = start + np.int64((cx + cy + cz) if dense else ((cx ^ cy ^ cz) & mask))
-                    weight = wx * wy * wz
-                    along = np.float32(0)
-                    for f in range(features):
-                        g = gradient[i, level * features + f]
-                        table_gradient[row, f] += weight * g
-                        along += g * table[row, f]
-                    gx += along * sx * wy * wz
-                    gy += along * sy * wx * wz
-                    gz += along * sz * wx * wy
-                if with_points:
-                    inside_x = point[i, 0] >= 0 and point[i, 0] <= 1
-                    inside_y = point[i, 1] >= 0 and point[i, 1] <= 1
-                    inside_z = point[i, 2] >= 0 and point[i, 2] <= 1
-                    point_gradient[level, i, 0] = gx * cells if inside_x else np.float32(0)
-                    point_gradient[level, i, 1] = gy * cells if inside_y else np.float32(0)
-                    point_gradient[level, i, 2] = gz * cells if inside_z else np.float32(0)
-
-    return encode, encode_backward
+    if vertices**3 <= rows:
+        return x + vertices * (y + vertices * z)
+    return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) % rows

@@ -1,15 +1,23 @@
-"""The numba kernels against the torch reference in float64, values and both gradients."""
+"""Every carrier of the encoding against the torch reference in float64, values and both gradients."""
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
+from torch import nn
 
-from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape, encode_reference
+from ebarf_ns.radiance.hash_grid import Carrier, HashGrid, HashGridShape, encode_reference, fastest_carrier
 
 SHAPES = [
     HashGridShape(levels=4, features=2, coarsest=4, finest=64, table_size_log2=10),
-    HashGridShape(levels=3, features=4, coarsest=2, finest=9, table_size_log2=12),
-    HashGridShape(levels=1, features=1, coarsest=5, finest=5, table_size_log2=4),
+    HashGridShape(levels=3, features=4, coarsest=3, finest=9, table_size_log2=12),
+    HashGridShape(levels=1, features=1, coarsest=5, finest=5, table_size_log2=7),
 ]
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+CARRIERS = ["triton"] if INTERPRETED else ["numba"]
 
 
 def random_points(count: int) -> torch.Tensor:
@@ -22,63 +30,185 @@ def special_points() -> torch.Tensor:
     return torch.cartesian_prod(steps, steps, steps)
 
 
-def both(shape: HashGridShape, point: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    torch.manual_seed(1)
-    grid = HashGrid(shape)
-    torch.nn.init.normal_(grid.table)
-    weight = torch.randn(len(point), grid.width)
+def made(shape: HashGridShape, carrier: Carrier | None = None, seed: int = 1) -> HashGrid:
+    torch.manual_seed(seed)
+    grid = HashGrid(shape, carrier)
+    nn.init.normal_(grid.table)
+    return grid
+
+
+def both(grid: HashGrid, point: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Values, table gradient and position gradient: of the grid, and of the reference in float64."""
+    torch.manual_seed(2)
+    weight = torch.randn(len(point), grid.shape.width)
+    poison(len(point), grid.shape.width)
     point = point.clone().requires_grad_()
     encoded = grid(point)
-    ours = [encoded.detach(), *torch.autograd.grad((encoded * weight).sum(), [grid.table, point])]
-    exact_point = point.detach().double().requires_grad_()
-    exact_table = grid.table.detach().double().requires_grad_()
-    exact = encode_reference(exact_point, exact_table, grid.resolution, grid.first_row)
+    ours = [encoded.detach(), *torch.autograd.grad((encoded * weight.to(encoded)).sum(), [grid.table, point])]
+    exact_point = point.detach().double().cpu().requires_grad_()
+    exact_table = grid.table.detach().double().cpu().requires_grad_()
+    exact = encode_reference(exact_point, exact_table, grid.lattice.cpu())
     theirs = [exact.detach(), *torch.autograd.grad((exact * weight).sum(), [exact_table, exact_point])]
-    return ours, theirs
+    return [one.cpu() for one in ours], theirs
 
 
+def poison(*shape: int) -> None:
+    """Leave memory full of NaN where the next arrays are likely to be placed: what is not written shows."""
+    for _ in range(3):
+        torch.full(shape, torch.nan)
+
+
+@pytest.mark.parametrize("carrier", CARRIERS)
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
-def test_values_and_gradients_agree_with_the_reference(shape: HashGridShape):
-    for ours, theirs in zip(*both(shape, random_points(5000)), strict=True):
-        scale = theirs.abs().max()
-        assert (ours - theirs).abs().max() < 1e-4 * scale
-
-
-@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
-def test_values_and_table_gradients_agree_on_borders_and_outside(shape: HashGridShape):
-    # Position gradients jump on cell borders, where either side's is right.
-    for ours, theirs in list(zip(*both(shape, special_points()), strict=True))[:2]:
+def test_values_and_gradients_agree_with_the_reference(carrier: Carrier, shape: HashGridShape):
+    for ours, theirs in zip(*both(made(shape, carrier), random_points(2000)), strict=True):
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
 
-def test_outside_the_cube_nothing_pulls():
-    grid = HashGrid(SHAPES[0])
-    torch.nn.init.normal_(grid.table)
+@pytest.mark.parametrize("carrier", CARRIERS)
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
+def test_values_and_table_gradients_agree_on_borders_and_outside(carrier: Carrier, shape: HashGridShape):
+    # Position gradients jump on cell borders, where either side's is right.
+    for ours, theirs in list(zip(*both(made(shape, carrier), special_points()), strict=True))[:2]:
+        assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
+
+
+@pytest.mark.parametrize("carrier", CARRIERS)
+def test_levels_come_in_by_their_weight_and_closed_ones_neither_give_nor_take(carrier: Carrier):
+    shape = SHAPES[0]
+    grid = made(shape, carrier)
+    grid.open_levels(2.5)
+    for ours, theirs in zip(*both(grid, random_points(500)), strict=True):
+        assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
+    values, table_gradient, _ = both(grid, random_points(500))[0]
+    assert (values[:, :4] != 0).all() and (values[:, 6:] == 0).all()
+    last = sum(shape.rows[:3])
+    assert table_gradient[:last].any() and not table_gradient[last:].any()
+    everything = made(shape, carrier)
+    half = values[:, 4:6] / everything(random_points(500))[:, 4:6]
+    assert torch.allclose(half, torch.full_like(half, 0.5), atol=1e-4)
+
+
+@pytest.mark.parametrize("carrier", CARRIERS)
+def test_outside_the_cube_nothing_pulls(carrier: Carrier):
     point = torch.tensor([[1.5, 0.3, -0.2]], requires_grad=True)
-    (gradient,) = torch.autograd.grad(grid(point).sum(), point)
+    (gradient,) = torch.autograd.grad(made(SHAPES[0], carrier)(point).sum(), point)
     assert gradient[0, 0] == 0 and gradient[0, 2] == 0 and gradient[0, 1] != 0
 
 
+@pytest.mark.parametrize("carrier", CARRIERS)
+def test_no_points_are_no_features(carrier: Carrier):
+    assert HashGrid(SHAPES[0], carrier)(torch.zeros(0, 3)).shape == (0, 8)
+
+
 def test_position_gradient_is_the_slope():
-    grid = HashGrid(SHAPES[0]).double()
-    torch.nn.init.normal_(grid.table)
+    grid = made(SHAPES[0]).double()
     assert torch.autograd.gradcheck(grid, [random_points(5).double().requires_grad_()], eps=1e-7, atol=1e-5)
 
 
 def test_levels_grow_from_coarsest_to_finest_and_small_ones_are_dense():
     shape = HashGridShape(levels=5, coarsest=4, finest=64, table_size_log2=12)
     assert shape.resolutions == [4, 8, 16, 32, 64]
-    assert shape.rows == [125, 729, 4096, 4096, 4096]
+    assert shape.rows == [64, 512, 4096, 4096, 4096]
 
 
-def test_no_points_are_no_features():
-    assert HashGrid(SHAPES[0])(torch.zeros(0, 3)).shape == (0, 8)
+def test_every_cell_within_the_cube_has_both_its_vertices():
+    shape = HashGridShape(levels=6, coarsest=3, finest=50)
+    stretch = HashGrid(shape).lattice.stretch.tolist()
+    assert all(
+        along + 0.5 <= resolution - 1 + 1e-4 for along, resolution in zip(stretch, shape.resolutions, strict=True)
+    )
+
+
+def test_the_carrier_follows_device_precision_and_what_is_importable(monkeypatch: pytest.MonkeyPatch):
+    on_cuda = SimpleNamespace(dtype=torch.float32, device=torch.device("cuda"), is_cuda=True)
+    present = {"triton"}
+    monkeypatch.setattr("ebarf_ns.radiance.hash_grid.find_spec", lambda name: name in present)
+    assert fastest_carrier(torch.zeros(1, 3)) == "numba"
+    assert fastest_carrier(torch.zeros(1, 3).double()) == "torch"
+    assert fastest_carrier(on_cuda) == "triton"  # pyright: ignore[reportArgumentType]
+    present.add("tinycudann")
+    assert fastest_carrier(on_cuda) == "tcnn"  # pyright: ignore[reportArgumentType]
+    present.clear()
+    assert fastest_carrier(on_cuda) == "torch"  # pyright: ignore[reportArgumentType]
+
+
+class StandInEncoding(nn.Module):
+    """tiny-cuda-nn's HashGrid by its published formulas: scale, resolution, offsets, index, interpolation."""
+
+    def __init__(self, inputs: int, configuration: dict, dtype: torch.dtype):
+        super().__init__()
+        assert inputs == 3 and configuration["otype"] == "HashGrid" and dtype == torch.float32
+        self.configuration = configuration
+        self.params = nn.Parameter(torch.zeros(1))
+
+    def forward(self, point: torch.Tensor) -> torch.Tensor:
+        c, offset, encoded = self.configuration, 0, []
+        features, largest = c["n_features_per_level"], 1 << c["log2_hashmap_size"]
+        for level in range(c["n_levels"]):
+            scale = 2.0 ** (level * torch.tensor(c["per_level_scale"]).log2().item()) * c["base_resolution"] - 1
+            resolution = int(torch.tensor(scale).ceil()) + 1
+            rows = min((resolution**3 + 7) // 8 * 8, largest)
+            place = point * scale + 0.5
+            low = place.detach().floor()
+            total = 0
+            for corner in range(8):
+                bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2])
+                weight = torch.where(bits > 0, place - low, 1 - (place - low)).prod(-1, keepdim=True)
+                x, y, z = (low.long() + bits).unbind(-1)
+                dense = x + y * resolution + z * resolution**2
+                index = (dense if resolution**3 <= rows else x ^ y * 2654435761 ^ z * 805459861) % rows
+                total = total + weight * self.params.view(-1, features)[offset + index]
+            encoded.append(total)
+            offset += rows
+        assert self.params.numel() == offset * features
+        return torch.cat(encoded, -1)
+
+
+@pytest.mark.parametrize("shape", SHAPES[:2], ids=lambda shape: f"{shape.levels}x{shape.features}")
+def test_our_table_means_the_same_to_tiny_cuda_nn(shape: HashGridShape, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "tinycudann", SimpleNamespace(Encoding=StandInEncoding))
+    monkeypatch.setattr("ebarf_ns.radiance.hash_grid._encodings", {})
+    grid = made(shape, "tcnn")
+    grid.open_levels(shape.levels - 0.5)
+    for ours, theirs in zip(*both(grid, random_points(500)), strict=True):
+        assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
+
+
+def test_triton_kernels_through_the_interpreter():
+    if INTERPRETED:
+        pytest.skip("this is the run inside")
+    pytest.importorskip("triton")
+    environment = {**os.environ, "TRITON_INTERPRET": "1"}
+    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__, "-k", "triton"]
+    inner = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert inner.returncode == 0, inner.stdout[-3000:] + inner.stderr[-2000:]
+    assert "9 passed" in inner.stdout
+
+
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled where the interpreter runs")
+@pytest.mark.parametrize("compute_capability", [80, 90])
+def test_triton_kernels_compile_to_machine_code_without_a_gpu(compute_capability: int):
+    pytest.importorskip("triton")
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    from ebarf_ns.radiance import hash_grid_triton
+
+    integers = {"resolution": "*i64", "first_row": "*i64", "count": "i32"}
+    fixed = {"levels": 8, "features": 4, "block": 128}
+    for kernel in (hash_grid_triton._forward, hash_grid_triton._backward):
+        types = {name: "constexpr" if name in fixed else integers.get(name, "*fp32") for name in kernel.arg_names}
+        compiled = triton.compile(ASTSource(kernel, types, fixed), target=GPUTarget("cuda", compute_capability, 32))
+        assert len(compiled.asm["cubin"]) > 1000
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_agrees_with_cpu():
-    grid = HashGrid(SHAPES[0])
-    torch.nn.init.normal_(grid.table)
-    point = random_points(1000)
-    assert torch.allclose(grid(point), grid.cuda()(point.cuda()).cpu(), atol=1e-4)
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
+def test_cuda_agrees_with_the_reference(shape: HashGridShape):
+    grid = made(shape).cuda()
+    assert fastest_carrier(random_points(1).cuda()) in ("triton", "tcnn")
+    for ours, theirs in zip(*both(grid, random_points(5000).cuda()), strict=True):
+        assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
