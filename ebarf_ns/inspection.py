@@ -9,7 +9,7 @@ from rich.table import Table
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
-from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
@@ -49,38 +49,40 @@ class Summary:
 def inspect_scene(folder: Path) -> Summary:
     """Read the whole scene; raises the reader's error for any file that training would stumble over."""
     scene = read_scene(folder)
-    recording = read_recording(scene.events, scene.camera.width, scene.camera.height)
     trajectory = read_tum(scene.trajectory)
     check_bounds(scene, trajectory)
     if scene.groundtruth:
         read_tum(scene.groundtruth)
     for frame in scene.frames:
         read_frame(frame)
-    summary = _summarize(scene, recording, trajectory)
+    summary = _summarize(scene, trajectory)
     try:
-        check_clocks(scene, recording.t_us, trajectory)
+        check_clocks(scene, (summary.start_us, summary.end_us), trajectory)
     except SceneError as error:
         summary.suspicions.append(str(error))
     summary.suspicions.extend(_suspicions(scene, summary, trajectory))
     return summary
 
 
-def _summarize(scene: Scene, recording: Recording, trajectory: Trajectory) -> Summary:
+def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
     camera = scene.camera
-    counts = np.bincount(
-        recording.y.astype(np.int64) * camera.width + recording.x, minlength=camera.width * camera.height
-    )
-    busiest = int(counts.argmax())
-    start_us, end_us = int(recording.t_us[0]), int(recording.t_us[-1])
+    file = RecordingFile(scene.events, camera.width, camera.height)
     first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    counts, brighter, within = np.zeros(camera.width * camera.height, np.int64), 0, 0
+    for chunk in file.chunks():
+        counts += np.bincount(chunk.pixels(camera.width), minlength=len(counts))
+        brighter += int((chunk.polarity > 0).sum())
+        within += len(chunk.between(first_us, last_us))
+    events, start_us, end_us = file.span()
+    busiest = int(counts.argmax())
     return Summary(
-        events=len(recording),
+        events=events,
         width=camera.width,
         height=camera.height,
         start_us=start_us,
         end_us=end_us,
-        events_per_second=len(recording) / max((end_us - start_us) * 1e-6, 1e-6),
-        brighter_share=float((recording.polarity > 0).mean()),
+        events_per_second=events / max((end_us - start_us) * 1e-6, 1e-6),
+        brighter_share=brighter / events,
         silent_pixel_share=float((counts == 0).mean()),
         events_per_active_pixel=float(counts[counts > 0].mean()),
         busiest_pixel=(busiest % camera.width, busiest // camera.width, int(counts[busiest])),
@@ -89,7 +91,7 @@ def _summarize(scene: Scene, recording: Recording, trajectory: Trajectory) -> Su
         trajectory_end_us=last_us,
         keyframes_per_second=(len(trajectory.t_us) - 1) / ((last_us - first_us) * 1e-6),
         path_length=float(trajectory.poses.position.diff(dim=0).norm(dim=-1).sum()),
-        events_within_trajectory=len(recording.between(first_us, last_us)),
+        events_within_trajectory=within,
         contrast_threshold=(scene.contrast_threshold.on, scene.contrast_threshold.off)
         if scene.contrast_threshold
         else None,

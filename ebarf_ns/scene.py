@@ -9,7 +9,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Int64
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.files import whole_file
@@ -97,16 +96,17 @@ def check_bounds(scene: Scene, trajectory: Trajectory) -> None:
         )
 
 
-def check_clocks(scene: Scene, event_t_us: Int64[np.ndarray, "events"], trajectory: Trajectory) -> None:
-    """Raise :class:`SceneError` when events and trajectory cannot be on one clock, in one unit of time."""
+def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajectory) -> None:
+    """Raise :class:`SceneError` when events, of which the first and last time are given, and trajectory cannot be on
+    one clock, in one unit of time."""
     keyframe_t_us = trajectory.t_us.numpy()
-    (start_us, end_us), (first_us, last_us) = event_t_us[[0, -1]].tolist(), keyframe_t_us[[0, -1]].tolist()
+    (start_us, end_us), (first_us, last_us) = events_us, keyframe_t_us[[0, -1]].tolist()
     among = int(((keyframe_t_us >= start_us) & (keyframe_t_us <= end_us)).sum())
     expected = f"expected {scene.trajectory.name} to be in seconds on the clock of the events"
-    if not ((event_t_us >= first_us) & (event_t_us <= last_us)).any():
+    if start_us > last_us or end_us < first_us:
         raise SceneError(
-            f"{scene.events}: none of the {len(event_t_us):,} events, {start_us} to {end_us} us, lies within the span "
-            f"of {scene.trajectory.name}, {first_us} to {last_us} us; {expected}"
+            f"{scene.events}: none of the events, {start_us} to {end_us} us, lies within the span of "
+            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}"
         )
     if among < 2 and last_us - first_us > _LONGEST_SPAN_RATIO * max(end_us - start_us, 1):
         raise SceneError(

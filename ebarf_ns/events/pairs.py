@@ -5,14 +5,26 @@ Events are kept ordered by pixel, then time, so that "n steps back" is a subtrac
 polarities over that order gives the sum between any two of them. Batches are a function of (seed, batch number) alone.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64, UInt8
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int64, Shaped, UInt8
+
+_EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
+"""Side by side, so that looking an event up touches one place in memory."""
+_ROUNDS = 100
 
 
 @dataclass(frozen=True)
@@ -29,105 +41,178 @@ class EventPairs:
     def __len__(self) -> int:
         return len(self.pixel)
 
+    def select(self, which: slice | Bool[np.ndarray, "pairs"]) -> EventPairs:
+        """The pairs at a slice or mask."""
+        return EventPairs(*(getattr(self, column.name)[which] for column in fields(self)))
+
 
 @dataclass(frozen=True)
 class PairIndex:
-    """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over such pairs."""
+    """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over such pairs.
 
-    pixel: Int32[np.ndarray, "events"]
-    t_us: Int64[np.ndarray, "events"]
-    running_polarity: Int32[np.ndarray, "events"]
-    """Sum of all polarities up to and including each event; meaningful as a difference within a pixel."""
-    rank: Int32[np.ndarray, "events"]
-    """Number of events of the same pixel before each event in the whole recording."""
-    ends: Int64[np.ndarray, "ends"]
-    """Events that may end a pair, those with the most predecessors first."""
-    pairs_by_steps: Int64[np.ndarray, "steps"]
-    """How many events have at least n predecessors, n = 0, 1, ...: the number of pairs n steps apart."""
+    Takes 12 bytes an event and 24 a pixel, in memory or in a file.
+    """
+
+    events: Shaped[np.ndarray, "events"]
+    """``t_us``, and ``running_polarity``: the sum of a pixel's polarities up to and including each event."""
+    first: Int64[np.ndarray, "pixels+1"]
+    """Where each pixel's events begin."""
+    busiest: Int64[np.ndarray, "pixels"]
+    """Pixels, those with the most events first."""
+    events_before: Int64[np.ndarray, "pixels+1"]
+    """Number of events of all the pixels before each place of ``busiest``."""
 
     @property
     def max_steps(self) -> int:
         """The longest pair there is, in steps."""
-        return len(self.pairs_by_steps) - 1
+        return int(self.events_before[1]) - 1
 
-    def sample(self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator) -> EventPairs:
-        """One pair for each entry of ``steps``, uniform over all pairs that many steps apart."""
+    def count(self, steps: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
+        """The number of pairs that many steps apart."""
+        pixels = self._pixels_with_pairs(steps)
+        return self.events_before[pixels] - steps * pixels
+
+    def _pixels_with_pairs(self, steps: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
+        return np.searchsorted(-np.diff(self.events_before), -steps)
+
+    def draw(self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator) -> EventPairs:
+        """One pair for each entry of ``steps`` (at most the longest there is), uniform over all so many steps apart."""
         steps = np.minimum(steps, self.max_steps)
-        last = self.ends[random.integers(self.pairs_by_steps[steps])]
-        return self.pairs(last - steps, last)
-
-    def pairs(self, first: Int64[np.ndarray, "pairs"], last: Int64[np.ndarray, "pairs"]) -> EventPairs:
-        """The pairs between given positions of the order, which must lie in the same pixel."""
-        return EventPairs(
-            self.pixel[last].astype(np.int64),
-            self.t_us[first],
-            self.t_us[last],
-            (self.running_polarity[last] - self.running_polarity[first]).astype(np.int64),
-            (self.rank[last] - self.rank[first]).astype(np.int64),
+        number = random.integers(self.count(steps))
+        pixel, last = _locate(
+            number, steps, self._pixels_with_pairs(steps), self.events_before, self.busiest, self.first
         )
+        before, after = self.events[last - steps], self.events[last]
+        polarity_sum = after["running_polarity"].astype(np.int64) - before["running_polarity"]
+        return EventPairs(pixel, before["t_us"].copy(), after["t_us"].copy(), polarity_sum, steps)
 
+    def draw_accepted(
+        self,
+        count: int,
+        longest: int,
+        random: np.random.Generator,
+        accepted: Callable[[EventPairs], Bool[np.ndarray, "pairs"]],
+    ) -> EventPairs:
+        """``count`` pairs that ``accepted`` lets through, 1 to ``longest`` steps apart, log-uniformly.
 
-def split_pairs(
-    recording: Recording, width: int, height: int, heldout: Bool[np.ndarray, "events"]
-) -> tuple[PairIndex, PairIndex]:
-    """Index the pairs for training and the pairs held out.
-
-    Training pairs begin and end at events outside ``heldout`` (their sums count the events in between all the same);
-    held-out pairs end at an event inside it. Raises :class:`RecordingError` when no pixel has two training events.
-    """
-    pixel = recording.y.astype(np.int32) * width + recording.x
-    order, first_of_pixel = _order_by_pixel(pixel, width * height)
-    pixel = pixel[order]
-    rank = (np.arange(len(order)) - first_of_pixel[pixel]).astype(np.int32)
-    columns = (pixel, recording.t_us[order], np.cumsum(recording.polarity[order], dtype=np.int32), rank)
-    heldout = heldout[order]
-    kept_pixel, kept_t_us, kept_polarity, kept_rank = (column[~heldout] for column in columns)
-    predecessors = _predecessors(kept_pixel)
-    if not (predecessors > 0).any():
-        raise RecordingError(f"none of the {len(recording):,} events has another one at its pixel: no pair to train on")
-    return (
-        PairIndex(
-            kept_pixel,
-            kept_t_us,
-            kept_polarity,
-            kept_rank,
-            *_by_predecessors(predecessors, np.arange(len(predecessors))),
-        ),
-        PairIndex(*columns, *_by_predecessors(rank[heldout], np.flatnonzero(heldout))),
-    )
-
-
-def _by_predecessors(predecessors: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    histogram = np.bincount(predecessors, minlength=1)
-    at_least = histogram[::-1].cumsum()[::-1]
-    return positions[np.argsort(-predecessors, kind="stable")], at_least.astype(np.int64)
-
-
-def _predecessors(pixel: np.ndarray) -> np.ndarray:
-    starts = np.flatnonzero(np.r_[True, pixel[1:] != pixel[:-1]]) if len(pixel) else np.zeros(0, np.int64)
-    return np.arange(len(pixel)) - np.repeat(starts, np.diff(np.r_[starts, len(pixel)]))
+        Fewer, possibly none, where a hundred times as many drawn at random hold no more.
+        """
+        found: list[EventPairs] = []
+        missing = count
+        for _ in range(_ROUNDS):
+            drawn = self.draw(draw_steps(count, longest, random), random)
+            found.append(drawn.select(accepted(drawn)).select(slice(missing)))
+            missing -= len(found[-1])
+            if not missing:
+                break
+        return EventPairs(*(np.concatenate([getattr(part, c.name) for part in found]) for c in fields(EventPairs)))
 
 
 @njit(cache=True, nogil=True)
-def _order_by_pixel(pixel: np.ndarray, pixel_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Stable counting sort: the order, and the position at which each pixel begins."""
-    first = np.zeros(pixel_count + 1, np.int64)
-    for i in range(len(pixel)):
-        first[pixel[i] + 1] += 1
-    for p in range(pixel_count):
-        first[p + 1] += first[p]
-    free = first[:-1].copy()
-    order = np.empty(len(pixel), np.int64)
-    for i in range(len(pixel)):
-        order[free[pixel[i]]] = i
-        free[pixel[i]] += 1
-    return order, first[:-1]
+def _locate(number, steps, pixels, events_before, busiest, first):
+    """The pixel and the last event of pair ``number`` among those ``steps`` apart, counted along ``busiest``."""
+    pixel, last = np.empty(len(number), np.int64), np.empty(len(number), np.int64)
+    for i in range(len(number)):
+        low, high = 0, pixels[i] - 1
+        while low < high:
+            middle = (low + high + 1) // 2
+            if events_before[middle] - steps[i] * middle <= number[i]:
+                low = middle
+            else:
+                high = middle - 1
+        pixel[i] = busiest[low]
+        last[i] = first[pixel[i]] + steps[i] + number[i] - (events_before[low] - steps[i] * low)
+    return pixel, last
 
 
-def heldout_blocks(t_us: Int64[np.ndarray, "events"], share: float, blocks: int = 20) -> Bool[np.ndarray, "events"]:
-    """Mark the events in ``blocks`` evenly spaced windows that together cover ``share`` of the recording's span."""
-    phase = (t_us - t_us[0]) / max(int(t_us[-1] - t_us[0]), 1) * blocks % 1
-    return np.abs(phase - 0.5) < share / 2
+def index_pairs(
+    chunks: Callable[[], Iterable[Recording]], width: int, height: int, memory_bytes: int = 1 << 62
+) -> PairIndex:
+    """Order events by pixel and time; ``chunks`` gives them in order of time, and is asked twice or more.
+
+    An index beyond ``memory_bytes`` lives in a temporary file, and is made a part of the sensor at a time, with one
+    more pass through the events for each part. Raises :class:`RecordingError` when no pixel has two events.
+    """
+    pixels = width * height
+    counts = np.zeros(pixels, np.int64)
+    for chunk in chunks():
+        counts += np.bincount(chunk.pixels(width), minlength=pixels)
+    first = np.r_[0, counts.cumsum()]
+    total = int(first[-1])
+    if counts.max() < 2:
+        raise RecordingError(f"none of the {total:,} events has another one at its pixel: no pair to train on")
+    in_memory = total * _EVENT.itemsize <= memory_bytes
+    events = np.empty(total, _EVENT) if in_memory else _file_backed(total)
+    begin = 0
+    while begin < pixels:
+        at_once = pixels if in_memory else memory_bytes // _EVENT.itemsize
+        end = max(int(np.searchsorted(first, first[begin] + at_once, side="right")) - 1, begin + 1)
+        end = min(end, pixels)
+        part = events[first[begin] : first[end]]
+        free, sums = first[begin:end] - first[begin], np.zeros(end - begin, np.int32)
+        for chunk in chunks():
+            _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
+        begin = end
+    busiest = np.argsort(-counts, kind="stable")
+    return PairIndex(events, first, busiest, np.r_[0, counts[busiest].cumsum()])
+
+
+def _file_backed(count: int) -> np.ndarray:
+    # Without a name: the space is free again when the process ends, however it ends.
+    return np.memmap(tempfile.TemporaryFile(), _EVENT, "r+", shape=(count,))
+
+
+@njit(cache=True, nogil=True)
+def _place(pixel, t_us, polarity, begin, free, sums, part):
+    """Counting sort: each event of the pixels from ``begin`` on goes to its pixel's next free place."""
+    for i in range(len(pixel)):
+        p = pixel[i] - begin
+        if 0 <= p < len(free):
+            sums[p] += polarity[i]
+            part[free[p]]["t_us"] = t_us[i]
+            part[free[p]]["running_polarity"] = sums[p]
+            free[p] += 1
+
+
+@dataclass(frozen=True)
+class HeldoutBlocks:
+    """``blocks`` evenly spaced windows that together cover ``share`` of the time from ``start_us`` to ``end_us``."""
+
+    start_us: int
+    end_us: int
+    share: float
+    blocks: int = 20
+
+    def contain(self, t_us: Int64[np.ndarray, "*batch"]) -> Bool[np.ndarray, "*batch"]:
+        """Whether each time lies in one of the windows."""
+        phase = (t_us - self.start_us) / max(self.end_us - self.start_us, 1) * self.blocks % 1
+        return np.abs(phase - 0.5) < self.share / 2
+
+    def training(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
+        """Pairs that begin and end outside; their sums count the events in between all the same."""
+        return ~(self.contain(pairs.t0_us) | self.contain(pairs.t1_us))
+
+    def heldout(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
+        """Pairs that end inside."""
+        return self.contain(pairs.t1_us)
+
+
+class DrawAhead:
+    """Draws batch k + ``stride`` in a thread of its own while batch k is used."""
+
+    def __init__(self, draw: Callable[[int], EventPairs], stride: int = 1):
+        self._draw, self._stride = draw, stride
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="event pairs")
+        self._ahead: tuple[int, Future[EventPairs]] | None = None
+
+    def batch(self, number: int) -> EventPairs:
+        """Batch ``number``, waited for where it was not the one expected."""
+        expected = self._ahead is not None and self._ahead[0] == number
+        future = self._ahead[1] if expected and self._ahead else self._worker.submit(self._draw, number)
+        pairs = future.result()
+        following = number + self._stride
+        self._ahead = following, self._worker.submit(self._draw, following)
+        return pairs
 
 
 def draw_steps(count: int, longest: int, random: np.random.Generator) -> Int64[np.ndarray, "pairs"]:
@@ -143,5 +228,5 @@ def batch_random(seed: int, batch: int) -> np.random.Generator:
 def accumulate(recording: Recording, width: int, height: int) -> UInt8[np.ndarray, "height width"]:
     """A grey picture of the events: mid-grey where there are none, brighter or darker by the polarities' sum."""
     picture = np.zeros(width * height, np.int64)
-    np.add.at(picture, recording.y.astype(np.int64) * width + recording.x, recording.polarity)
+    np.add.at(picture, recording.pixels(width), recording.polarity)
     return (128 + np.clip(32 * picture, -128, 127)).astype(np.uint8).reshape(height, width)

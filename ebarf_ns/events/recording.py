@@ -1,15 +1,25 @@
-"""The recording: event columns with int64 microseconds, read from HDF5 with every value checked."""
+"""The recording: event columns with int64 microseconds, read from HDF5 in pieces with every value checked."""
 
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
-import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5
 import numpy as np
-from jaxtyping import Bool, Int8, Int64, UInt16
 
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.files import whole_file
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int8, Int64, UInt16
+
+with suppress(ImportError):
+    import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5
 
 # Also the longest recording that gets a ms_to_idx table: about 6 days.
 _MAX_SPAN_US = 1 << 39
@@ -29,68 +39,125 @@ class Recording:
     def __len__(self) -> int:
         return len(self.t_us)
 
-    def select(self, which: slice | Bool[np.ndarray, "events"]) -> "Recording":
+    def select(self, which: slice | Bool[np.ndarray, "events"]) -> Recording:
         """The events at a slice or mask."""
         return Recording(self.x[which], self.y[which], self.t_us[which], self.polarity[which])
 
-    def between(self, start_us: int, end_us: int) -> "Recording":
+    def between(self, start_us: int, end_us: int) -> Recording:
         """The events from ``start_us`` to ``end_us``, both included."""
         first, last = np.searchsorted(self.t_us, [start_us, end_us + 1])
         return self.select(slice(first, last))
 
+    def pixels(self, width: int) -> Int64[np.ndarray, "events"]:
+        """Row-major index y * width + x of each event's pixel."""
+        return self.y.astype(np.int64) * width + self.x
+
+
+@dataclass(frozen=True)
+class RecordingFile:
+    """An HDF5 file in the layout of TUM-VIE or DSEC, ``/events/{x,y,t,p}`` and ``/t_offset``, of any size.
+
+    Nothing is repaired or dropped: whatever reads from it raises :class:`RecordingError` naming file, column, row,
+    value and expectation for anything that does not fit a ``width`` x ``height`` sensor.
+    """
+
+    path: Path
+    width: int
+    height: int
+
+    def span(self) -> tuple[int, int, int]:
+        """Number of events, and times of the first and last one in microseconds; between them, nothing is looked at."""
+        with self._columns() as (columns, t_offset_us):
+            ends = {name: column[:: max(len(column) - 1, 1)] for name, column in columns.items()}
+            self._check(ends, 0, None)
+            start_us, end_us = int(ends["t"][0]), int(ends["t"][-1])
+            return len(columns["t"]), start_us + t_offset_us, end_us + t_offset_us
+
+    def chunks(self, size: int = 1 << 22) -> Iterator[Recording]:
+        """All events, at most ``size`` at a time."""
+        with self._columns() as (columns, t_offset_us):
+            yield from self._pieces(columns, t_offset_us, 0, len(columns["t"]), size)
+
+    def window(self, start_us: int, end_us: int) -> Recording:
+        """The events from ``start_us`` to ``end_us``, both included, found by bisection; the rest is not looked at."""
+        with self._columns() as (columns, t_offset_us):
+            t = columns["t"]
+            first, last = bisect_left(t, start_us - t_offset_us), bisect_right(t, end_us - t_offset_us)
+            return _joined(self._pieces(columns, t_offset_us, first, last, 1 << 22))
+
+    def _pieces(
+        self, columns: dict[str, h5py.Dataset], t_offset_us: int, first: int, last: int, size: int
+    ) -> Iterator[Recording]:
+        before: int | None = None
+        for begin in range(first, last, size):
+            piece = {name: column[begin : min(begin + size, last)] for name, column in columns.items()}
+            self._check(piece, begin, before)
+            t_us = piece["t"].astype(np.int64)
+            before = int(t_us[-1])
+            yield Recording(
+                piece["x"].astype(np.uint16, copy=False),
+                piece["y"].astype(np.uint16, copy=False),
+                t_us + t_offset_us,
+                (2 * piece["p"].astype(np.int8) - 1).astype(np.int8),
+            )
+
+    @contextmanager
+    def _columns(self) -> Iterator[tuple[dict[str, h5py.Dataset], int]]:
+        path = self.path
+        try:
+            with h5py.File(path, "r") as file:
+                columns = {name: self._column(file, name) for name in ("x", "y", "t", "p")}
+                lengths = {name: len(column) for name, column in columns.items()}
+                if len(set(lengths.values())) > 1:
+                    raise RecordingError(
+                        f"{path}: columns of /events differ in length, {lengths}; expected one row per event"
+                    )
+                if not lengths["t"]:
+                    raise RecordingError(f"{path}: /events is empty, expected at least one event")
+                yield columns, int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
+        except OSError as error:
+            missing = "no such file, expected the recording"
+            reason = missing if not path.exists() else f"not a readable HDF5 file ({error})"
+            raise RecordingError(f"{path}: {reason}") from None
+
+    def _column(self, file: h5py.File, name: str) -> h5py.Dataset:
+        dataset = file.get(f"events/{name}")
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1:
+            raise RecordingError(f"{self.path}: dataset /events/{name} is missing, expected one column of integers")
+        if dataset.dtype.kind not in "iub":
+            raise RecordingError(f"{self.path}: /events/{name} holds {dataset.dtype}, expected integers")
+        return dataset
+
+    def _check(self, piece: dict[str, np.ndarray], begin: int, before: int | None) -> None:
+        """``begin`` is the row of the piece's first event, ``before`` the time of the event above it."""
+        x, y, t, p = (piece[name].view(np.uint8) if piece[name].dtype == bool else piece[name] for name in "xytp")
+        t_us = t.astype(np.int64)
+        late = np.r_[before is not None and bool(t_us[0] < before), t_us[1:] < t_us[:-1]]
+        for name, wrong, expected in (
+            ("x", (x < 0) | (x >= self.width), f"0 to {self.width - 1}, the sensor width"),
+            ("y", (y < 0) | (y >= self.height), f"0 to {self.height - 1}, the sensor height"),
+            ("p", (p < 0) | (p > 1), "0 (darker) or 1 (brighter)"),
+            ("t", (t > _MAX_TIME_US) | (t < -_MAX_TIME_US), f"microseconds within ±{_MAX_TIME_US}"),
+            ("t", late, "a time not before that of the event above it"),
+        ):
+            if wrong.any():
+                row = int(wrong.argmax())
+                raise RecordingError(
+                    f"{self.path}: /events/{name} row {begin + row} is {piece[name][row]}, expected {expected} "
+                    f"({np.count_nonzero(wrong):,} such rows of the {len(t):,} from row {begin} on)"
+                )
+
 
 def read_recording(path: Path, width: int, height: int) -> Recording:
-    """Read ``/events/{x,y,t,p}`` and ``/t_offset`` of a TUM-VIE or DSEC style file.
-
-    Raises :class:`RecordingError` naming file, column, row, value and expectation for anything that does not fit a
-    ``width`` x ``height`` sensor; nothing is repaired or dropped.
-    """
-    try:
-        with h5py.File(path, "r") as file:
-            columns = {name: _read_column(file, path, name) for name in ("x", "y", "t", "p")}
-            t_offset_us = int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
-    except OSError as error:
-        reason = "no such file, expected the recording" if not path.exists() else f"not a readable HDF5 file ({error})"
-        raise RecordingError(f"{path}: {reason}") from None
-    lengths = {name: len(column) for name, column in columns.items()}
-    if len(set(lengths.values())) > 1:
-        raise RecordingError(f"{path}: columns of /events differ in length, {lengths}; expected one row per event")
-    if not lengths["t"]:
-        raise RecordingError(f"{path}: /events is empty, expected at least one event")
-    _check(path, "x", columns["x"], (columns["x"] < 0) | (columns["x"] >= width), f"0 to {width - 1}, the sensor width")
-    _check(
-        path, "y", columns["y"], (columns["y"] < 0) | (columns["y"] >= height), f"0 to {height - 1}, the sensor height"
-    )
-    _check(path, "p", columns["p"], (columns["p"] < 0) | (columns["p"] > 1), "0 (darker) or 1 (brighter)")
-    t = columns["t"]
-    _check(path, "t", t, (t > _MAX_TIME_US) | (t < -_MAX_TIME_US), f"microseconds within ±{_MAX_TIME_US}")
-    t_us = t.astype(np.int64)
-    _check(path, "t", columns["t"], np.r_[False, t_us[1:] < t_us[:-1]], "a time not before that of the event above it")
-    return Recording(
-        columns["x"].astype(np.uint16),
-        columns["y"].astype(np.uint16),
-        t_us + t_offset_us,
-        (2 * columns["p"].astype(np.int8) - 1).astype(np.int8),
-    )
+    """All of a :class:`RecordingFile` in one piece."""
+    return _joined(RecordingFile(path, width, height).chunks())
 
 
-def _read_column(file: h5py.File, path: Path, name: str) -> np.ndarray:
-    dataset = file.get(f"events/{name}")
-    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1:
-        raise RecordingError(f"{path}: dataset /events/{name} is missing, expected one column of integers")
-    if dataset.dtype.kind not in "iub":
-        raise RecordingError(f"{path}: /events/{name} holds {dataset.dtype}, expected integers")
-    column = dataset[:]
-    return column.astype(np.uint8) if dataset.dtype.kind == "b" else column
-
-
-def _check(path: Path, name: str, column: np.ndarray, wrong: np.ndarray, expected: str) -> None:
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise RecordingError(
-            f"{path}: /events/{name} row {row} is {column[row]}, expected {expected} "
-            f"({np.count_nonzero(wrong):,} such rows of {len(column):,})"
-        )
+def _joined(pieces: Iterable[Recording]) -> Recording:
+    nothing = Recording(np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.int64), np.zeros(0, np.int8))
+    parts = list(pieces) or [nothing]
+    columns = ("x", "y", "t_us", "polarity")
+    return Recording(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
 def write_recording(path: Path, recording: Recording) -> None:

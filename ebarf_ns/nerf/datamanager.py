@@ -17,15 +17,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import EbarfError, RecordingError, one_line_errors
 from ebarf_ns.events.pairs import (
+    DrawAhead,
     EventPairs,
+    HeldoutBlocks,
     PairIndex,
     accumulate,
     batch_random,
-    draw_steps,
-    heldout_blocks,
-    split_pairs,
+    index_pairs,
 )
-from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
 from ebarf_ns.scene import Scene, check_clocks
@@ -40,7 +40,6 @@ class EventDataset(InputDataset):
     def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
         self.scene: Scene = self.metadata["scene"]
-        self.recording: Recording | None = None
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """8-bit grey in three channels, for people to look at; evaluation reads the frames themselves."""
@@ -58,17 +57,16 @@ class EventDataset(InputDataset):
 
     def _events_around(self, image_idx: int) -> np.ndarray:
         camera = self.scene.camera
-        if self.recording is None:
-            try:
-                self.recording = read_recording(self.scene.events, camera.width, camera.height)
-            except EbarfError:
-                # A trained run can be looked at when its recording is gone.
-                return np.full((camera.height, camera.width), 128, np.uint8)
         assert self.cameras.metadata is not None
         times = self.cameras.metadata["camera_t_us"][:, 0]
         half_us = int(times.diff().median()) // 2 if len(times) > 1 else 10_000
         t_us = int(times[image_idx])
-        return accumulate(self.recording.between(t_us - half_us, t_us + half_us), camera.width, camera.height)
+        try:
+            file = RecordingFile(self.scene.events, camera.width, camera.height)
+            return accumulate(file.window(t_us - half_us, t_us + half_us), camera.width, camera.height)
+        except EbarfError:
+            # A trained run can be looked at when its recording is gone.
+            return np.full((camera.height, camera.width), 128, np.uint8)
 
 
 @dataclass
@@ -85,6 +83,8 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
     heldout_share: float = 0.05
     """Share of the recording's time whose events are kept for heldout_event_loss."""
+    index_memory_gib: float = 4.0
+    """An index of events that needs more than this (12 bytes an event) is kept in a file, under TMPDIR."""
     seed: tyro.conf.Suppress[int] = 0
     """Set by the trainer to --machine.seed; batch number k of a seed is always the same batch."""
 
@@ -100,10 +100,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
         if self.test_mode == "val":
-            recording = self.recording
-            CONSOLE.print(
-                f"{len(recording):,} events, {self.pairs[0].pairs_by_steps[1]:,} consecutive pairs to train on"
-            )
+            events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
+            CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
 
     def setup_eval(self) -> None:
         """The loaders of full views that nerfstudio's scripts ask for."""
@@ -111,26 +109,57 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
 
     @cached_property
-    def recording(self) -> Recording:
-        """The events within the trajectory's span; those outside are counted and left out."""
+    def span_us(self) -> tuple[int, int]:
+        """The time in which there are both events and poses; events outside are counted and left out."""
         scene: Scene = self.train_dataset.scene
-        keyframes: Trajectory = self.train_dataset.metadata["keyframes"]
-        start_us, end_us = int(keyframes.t_us[0]), int(keyframes.t_us[-1])
-        whole = read_recording(scene.events, scene.camera.width, scene.camera.height)
-        check_clocks(scene, whole.t_us, self.train_dataset.metadata["trajectory"])
-        recording = whole.between(start_us, end_us)
-        if len(recording) < len(whole):
-            CONSOLE.print(
-                f"left out {len(whole) - len(recording):,} of {len(whole):,} events, outside the trajectory's span"
-            )
-        return recording
+        trajectory: Trajectory = self.train_dataset.metadata["trajectory"]
+        file = self._recording
+        _, start_us, end_us = file.span()
+        check_clocks(scene, (start_us, end_us), trajectory)
+        return max(start_us, int(trajectory.t_us[0])), min(end_us, int(trajectory.t_us[-1]))
+
+    @property
+    def _recording(self) -> RecordingFile:
+        scene: Scene = self.train_dataset.scene
+        return RecordingFile(scene.events, scene.camera.width, scene.camera.height)
 
     @cached_property
-    def pairs(self) -> tuple[PairIndex, PairIndex]:
-        """Pairs for training and pairs held out."""
-        camera = self.train_dataset.scene.camera
-        heldout = heldout_blocks(self.recording.t_us, self.config.heldout_share)
-        return split_pairs(self.recording, camera.width, camera.height, heldout)
+    def index(self) -> PairIndex:
+        """All events within the trajectory's span, ready to draw pairs from."""
+        file = self._recording
+        memory_bytes = int(self.config.index_memory_gib * 2**30)
+        within = lambda: (chunk.between(*self.span_us) for chunk in file.chunks())  # noqa: E731
+        index = index_pairs(within, file.width, file.height, memory_bytes)
+        total, _, _ = file.span()
+        if len(index.events) < total:
+            CONSOLE.print(f"left out {total - len(index.events):,} of {total:,} events, outside the trajectory's span")
+        return index
+
+    @property
+    def _heldout_blocks(self) -> HeldoutBlocks:
+        return HeldoutBlocks(*self.span_us, self.config.heldout_share)
+
+    @cached_property
+    def _training_batches(self) -> DrawAhead:
+        return DrawAhead(self._draw_training_pairs, self.world_size)
+
+    def _draw_training_pairs(self, batch: int) -> EventPairs:
+        count = self.get_train_rays_per_batch() // 2
+        random = batch_random(self.config.seed, batch)
+        pairs = self.index.draw_accepted(count, self.config.longest_pair, random, self._heldout_blocks.training)
+        if len(pairs) < count:
+            raise RecordingError(
+                f"{self.train_dataset.scene.events}: next to no pair of events lies outside the held-out "
+                f"{self.config.heldout_share:.0%} of the recording: no pair to train on"
+            )
+        return pairs
+
+    @cached_property
+    def heldout_pairs(self) -> EventPairs:
+        """Pairs that no training sees, the same for every method and seed."""
+        count = self.config.eval_num_rays_per_batch // 2
+        random = batch_random(_HELDOUT_SEED, 0)
+        return self.index.draw_accepted(count, _LONGEST_HELDOUT_PAIR, random, self._heldout_blocks.heldout)
 
     @cached_property
     def bearings(self) -> torch.Tensor:
@@ -142,24 +171,18 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Rays of batch number ``step``; scripts that keep asking for step 0 get one batch after another."""
         self.train_count += 1
         batch = step if self.test_mode == "val" else self.train_count
-        random = batch_random(self.config.seed, batch * self.world_size + self.local_rank)
-        count = self.get_train_rays_per_batch() // 2
-        steps = draw_steps(count, self.config.longest_pair, random)
         with one_line_errors():
-            return self._rays(self.pairs[0].sample(steps, random))
+            return self._rays(self._training_batches.batch(batch * self.world_size + self.local_rank))
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
         """Rays of the held-out pairs, the same for every step, method and seed."""
         self.eval_count += 1
-        heldout = self.pairs[1]
-        if not heldout.max_steps:
+        if not len(self.heldout_pairs):
             raise RecordingError(
                 f"{self.train_dataset.scene.events}: no pair of events ends in the held-out "
                 f"{self.config.heldout_share:.0%} of the recording; expected a larger share or a longer recording"
             )
-        random = batch_random(_HELDOUT_SEED, 0)
-        steps = draw_steps(self.config.eval_num_rays_per_batch // 2, _LONGEST_HELDOUT_PAIR, random)
-        return self._rays(heldout.sample(steps, random))
+        return self._rays(self.heldout_pairs)
 
     def get_train_rays_per_batch(self) -> int:
         """What ns-export overwrites by --num-rays-per-batch."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss
-from ebarf_ns.radiance.field import IntensityRange, RadianceField
+from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField, fastest_precision
 from ebarf_ns.radiance.hash_grid import HashGridShape
 from ebarf_ns.radiance.ray_sampling import (
     DensityGrid,
@@ -55,7 +55,7 @@ class EbarfModelConfig(ModelConfig):
     grid_table_size_log2: int = 17
     sampling: Literal["importance", "uniform"] = "importance"
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
-    samples: int = 48
+    samples: int = 24
     """Points per ray at which the field is asked."""
     coarse_samples: int = 128
     """Points per ray at which the remembered density is looked up for importance sampling."""
@@ -67,6 +67,8 @@ class EbarfModelConfig(ModelConfig):
     """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
     density_bias: float = 0.0
     """Log density at the start of training."""
+    precision: Precision | Literal["auto"] = "auto"
+    """Of the MLPs' products; auto is bfloat16 where the processor multiplies it natively, else float32."""
 
 
 class EbarfModel(Model):
@@ -92,7 +94,12 @@ class EbarfModel(Model):
             config.grid_table_size_log2,
         )
         self.field = RadianceField(
-            shape, bounded, config.view_dependent, config.intensity_range, density_bias=config.density_bias
+            shape,
+            bounded,
+            config.view_dependent,
+            config.intensity_range,
+            density_bias=config.density_bias,
+            precision=fastest_precision(self.kwargs["device"]) if config.precision == "auto" else config.precision,
         )
         if config.sampling == "importance":
             self.density_grid = DensityGrid(config.density_cells, bounded)

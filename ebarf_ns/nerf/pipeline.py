@@ -104,7 +104,7 @@ class EbarfPipeline(VanillaPipeline):
         return results
 
     def _heldout_event_loss(self) -> float | None:
-        if not self.scene.events.is_file() or not self.datamanager.pairs[1].max_steps:
+        if not self.scene.events.is_file() or not len(self.datamanager.heldout_pairs):
             return None
         rays, batch = self.datamanager.next_eval(0)
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)

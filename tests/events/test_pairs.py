@@ -4,7 +4,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.pairs import accumulate, batch_random, draw_steps, heldout_blocks, split_pairs
+from ebarf_ns.events.pairs import (
+    DrawAhead,
+    EventPairs,
+    HeldoutBlocks,
+    PairIndex,
+    accumulate,
+    batch_random,
+    draw_steps,
+    index_pairs,
+)
 from ebarf_ns.events.recording import Recording
 
 WIDTH, HEIGHT = 4, 3
@@ -20,8 +29,10 @@ def recording(seed: int, count: int) -> Recording:
     )
 
 
-def nothing_heldout(events: Recording) -> np.ndarray:
-    return np.zeros(len(events), bool)
+def index_of(events: Recording, chunk: int = 50, memory_bytes: int = 1 << 40) -> PairIndex:
+    """Built from pieces of ``chunk`` events."""
+    pieces = [events.select(slice(k, k + chunk)) for k in range(0, len(events), chunk)]
+    return index_pairs(lambda: pieces, WIDTH, HEIGHT, memory_bytes)
 
 
 def by_pixel(events: Recording) -> dict[int, list[int]]:
@@ -35,9 +46,9 @@ def by_pixel(events: Recording) -> dict[int, list[int]]:
 @given(st.integers(0, 1000), st.integers(30, 200), st.integers(1, 5))
 def test_every_pair_is_what_the_stream_says(seed: int, count: int, steps: int):
     events = recording(seed, count)
-    index, _ = split_pairs(events, WIDTH, HEIGHT, nothing_heldout(events))
+    index = index_of(events)
     steps = min(steps, index.max_steps)
-    pairs = index.sample(np.full(300, steps), np.random.default_rng(seed))
+    pairs = index.draw(np.full(300, steps), np.random.default_rng(seed))
     truth = by_pixel(events)
     for pixel, t0, t1, total, number in zip(
         pairs.pixel, pairs.t0_us, pairs.t1_us, pairs.polarity_sum, pairs.event_count, strict=True
@@ -54,12 +65,14 @@ def test_every_pair_is_what_the_stream_says(seed: int, count: int, steps: int):
 
 def test_pairs_are_drawn_uniformly_and_all_of_them():
     events = recording(1, 60)
-    index, _ = split_pairs(events, WIDTH, HEIGHT, nothing_heldout(events))
+    # Times that tell every event from every other.
+    events = Recording(events.x, events.y, np.arange(60, dtype=np.int64), events.polarity)
+    index = index_of(events)
     for steps in (1, 3):
         expected = sum(max(0, len(rows) - steps) for rows in by_pixel(events).values())
-        assert index.pairs_by_steps[steps] == expected
-        last = index.ends[np.random.default_rng(0).integers(index.pairs_by_steps[np.full(200 * expected, steps)])]
-        counts = np.bincount(last)[np.unique(last)]
+        assert index.count(np.array(steps)) == expected
+        drawn = index.draw(np.full(200 * expected, steps), np.random.default_rng(0))
+        counts = np.unique(drawn.t1_us, return_counts=True)[1]
         assert len(counts) == expected
         # 200 draws a pair on average: five standard deviations.
         assert np.abs(counts - 200).max() < 5 * np.sqrt(200)
@@ -67,25 +80,57 @@ def test_pairs_are_drawn_uniformly_and_all_of_them():
 
 def test_heldout_pairs_end_inside_and_training_pairs_stay_outside():
     events = recording(2, 400)
-    heldout = heldout_blocks(events.t_us, 0.3, blocks=4)
+    blocks = HeldoutBlocks(int(events.t_us[0]), int(events.t_us[-1]), 0.3, blocks=4)
+    heldout = blocks.contain(events.t_us)
     assert 0.15 < heldout.mean() < 0.45
-    training, kept_back = split_pairs(events, WIDTH, HEIGHT, heldout)
-    times = set(events.t_us[heldout].tolist()) - set(events.t_us[~heldout].tolist())
-    random = np.random.default_rng(0)
-    drawn = training.sample(draw_steps(500, 10, random), random)
-    assert not times & (set(drawn.t0_us.tolist()) | set(drawn.t1_us.tolist()))
-    drawn = kept_back.sample(draw_steps(500, 10, random), random)
-    assert set(drawn.t1_us.tolist()) <= set(events.t_us[heldout].tolist())
+    index, random = index_of(events), np.random.default_rng(0)
+    inside = set(events.t_us[heldout].tolist())
+    drawn = index.draw_accepted(500, 10, random, blocks.training)
+    assert len(drawn) == 500 and not inside & (set(drawn.t0_us.tolist()) | set(drawn.t1_us.tolist()))
+    drawn = index.draw_accepted(500, 10, random, blocks.heldout)
+    assert len(drawn) == 500 and set(drawn.t1_us.tolist()) <= inside
+
+
+def test_where_nothing_is_accepted_nothing_is_drawn():
+    drawn = index_of(recording(2, 400)).draw_accepted(
+        50, 10, np.random.default_rng(0), lambda pairs: np.zeros(len(pairs), bool)
+    )
+    assert len(drawn) == 0
 
 
 def test_training_pairs_across_a_heldout_block_count_the_events_in_it():
     t = np.arange(5, dtype=np.int64)
     ones = np.ones(5, np.int8)
-    events = Recording(np.zeros(5, np.uint16), np.zeros(5, np.uint16), t, ones)
-    training, _ = split_pairs(events, WIDTH, HEIGHT, np.array([False, False, True, True, False]))
-    pairs = training.sample(np.ones(50, np.int64), np.random.default_rng(0))
-    across = pairs.t1_us == 4
-    assert (pairs.polarity_sum[across] == 3).all() and (pairs.event_count[across] == 3).all()
+    index = index_of(Recording(np.zeros(5, np.uint16), np.zeros(5, np.uint16), t, ones))
+    blocks = HeldoutBlocks(0, 4, 0.6, blocks=1)
+    assert blocks.contain(t).tolist() == [False, True, True, True, False]
+    pairs = index.draw_accepted(50, 4, np.random.default_rng(0), blocks.training)
+    assert len(pairs) and (pairs.polarity_sum == 4).all() and (pairs.event_count == 4).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 300), st.integers(16, 2000))
+def test_index_is_the_same_whatever_the_pieces_and_wherever_it_lies(seed: int, chunk: int, memory_bytes: int):
+    events = recording(seed, 300)
+    whole, pieces = index_of(events, 300), index_of(events, chunk, memory_bytes)
+    assert isinstance(pieces.events, np.memmap) and not isinstance(whole.events, np.memmap)
+    for name in ("events", "first", "busiest", "events_before"):
+        assert np.array_equal(getattr(whole, name), getattr(pieces, name))
+
+
+def test_batches_drawn_ahead_are_those_asked_for():
+    index = index_of(recording(3, 300))
+    drawn: list[int] = []
+
+    def draw(batch: int) -> EventPairs:
+        drawn.append(batch)
+        random = batch_random(0, batch)
+        return index.draw(draw_steps(20, 5, random), random)
+
+    ahead = DrawAhead(draw, stride=2)
+    for batch in (0, 2, 4, 10, 12, 12):
+        assert np.array_equal(ahead.batch(batch).t1_us, draw(batch).t1_us)
+    assert 14 in drawn
 
 
 def test_a_batch_depends_on_seed_and_number_alone():
@@ -110,7 +155,7 @@ def test_no_second_event_anywhere_is_an_error():
         np.arange(4, dtype=np.uint16), np.zeros(4, np.uint16), np.arange(4, dtype=np.int64), np.ones(4, np.int8)
     )
     with pytest.raises(RecordingError, match="no pair to train on"):
-        split_pairs(events, WIDTH, HEIGHT, nothing_heldout(events))
+        index_of(events)
 
 
 def test_accumulated_picture_shows_polarity():

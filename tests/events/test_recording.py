@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.recording import Recording, read_recording, write_recording
+from ebarf_ns.events.recording import Recording, RecordingFile, read_recording, write_recording
 
 WIDTH, HEIGHT = 24, 18
 GOOD = {"x": [0, 23, 5], "y": [0, 17, 5], "t": [10, 10, 2500], "p": [0, 1, 1]}
@@ -96,6 +96,32 @@ def test_cut_file_is_an_error_at_every_length(tmp_path: Path):
 def test_missing_file_is_named(tmp_path: Path):
     with pytest.raises(RecordingError, match="no such file"):
         read_recording(tmp_path / "gone.h5", WIDTH, HEIGHT)
+
+
+@given(st.integers(1, 300), st.integers(0, 1100), st.integers(0, 1100), st.sampled_from([0, -70, 10**15]))
+def test_pieces_of_any_size_are_bitwise_the_window_asked_for(
+    tmp_path_factory: pytest.TempPathFactory, size: int, a: int, b: int, t_offset: int
+):
+    random = np.random.default_rng(5)
+    columns = {"x": random.integers(0, 24, 200), "y": random.integers(0, 18, 200), "p": random.integers(0, 2, 200)}
+    path = tmp_path_factory.mktemp("h5") / "e.h5"
+    write(path, t_offset, t=np.sort(random.integers(0, 1000, 200)), **columns)
+    start_us, end_us = min(a, b) + t_offset, max(a, b) + t_offset
+    expected = read_recording(path, WIDTH, HEIGHT).between(start_us, end_us)
+    file = RecordingFile(path, WIDTH, HEIGHT)
+    pieces = list(file.chunks(size))
+    assert all(0 < len(piece) <= size for piece in pieces) and file.span()[0] == 200
+    for column in ("x", "y", "t_us", "polarity"):
+        joined = np.concatenate([getattr(piece.between(start_us, end_us), column) for piece in pieces])
+        assert np.array_equal(joined, getattr(expected, column))
+        assert np.array_equal(getattr(file.window(start_us, end_us), column), getattr(expected, column))
+
+
+def test_disorder_across_pieces_is_found_with_its_row(tmp_path: Path):
+    file = RecordingFile(write(tmp_path / "e.h5", t=[10, 20, 19]), WIDTH, HEIGHT)
+    for size in (1, 2, 3):
+        with pytest.raises(RecordingError, match="/events/t row 2 is 19, expected a time not before"):
+            list(file.chunks(size=size))
 
 
 def test_between_includes_both_ends(tmp_path: Path):

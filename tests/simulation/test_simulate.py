@@ -8,7 +8,7 @@ import torch
 from ebarf_ns.errors import SimulationError
 from ebarf_ns.evaluation.frames import read_frame
 from ebarf_ns.evaluation.trajectory_error import trajectory_error
-from ebarf_ns.events.pairs import split_pairs
+from ebarf_ns.events.pairs import index_pairs
 from ebarf_ns.events.recording import read_recording
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
 from ebarf_ns.geometry.trajectory import interpolate
@@ -34,8 +34,8 @@ def test_events_agree_with_the_room_seen_from_the_true_poses(tiny_scene: Path):
     scene = read_scene(tiny_scene)
     assert scene.groundtruth and scene.contrast_threshold
     recording = read_recording(scene.events, scene.camera.width, scene.camera.height)
-    index, _ = split_pairs(recording, scene.camera.width, scene.camera.height, np.zeros(len(recording), bool))
-    pairs = index.sample(np.full(400, 3), np.random.default_rng(0))
+    index = index_pairs(lambda: [recording], scene.camera.width, scene.camera.height)
+    pairs = index.draw(np.full(2000, 3), np.random.default_rng(0))
     truth = read_tum(scene.groundtruth)
     corners = scene.camera.pixel_grid().flatten(0, 1)[pairs.pixel][:, None] + torch.tensor(
         [[-0.25, -0.25], [-0.25, 0.25], [0.25, -0.25], [0.25, 0.25]]
