@@ -69,22 +69,20 @@ class PairIndex:
 
     def count(self, steps: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
         """The number of pairs that many steps apart."""
-        pixels = self._pixels_with_pairs(steps)
-        return self.events_before[pixels] - steps * pixels
+        return self._count(steps)[1]
 
-    def _pixels_with_pairs(self, steps: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
-        return np.searchsorted(-np.diff(self.events_before), -steps)
+    def _count(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels that have pairs that many steps apart, which are the first of ``busiest``, and the pairs in them."""
+        pixels = np.searchsorted(-np.diff(self.events_before), -steps)
+        return pixels, self.events_before[pixels] - steps * pixels
 
     def draw(self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator) -> EventPairs:
         """One pair for each entry of ``steps`` (at most the longest there is), uniform over all so many steps apart."""
         steps = np.minimum(steps, self.max_steps)
-        number = random.integers(self.count(steps))
-        pixel, last = _locate(
-            number, steps, self._pixels_with_pairs(steps), self.events_before, self.busiest, self.first
-        )
-        before, after = self.events[last - steps], self.events[last]
-        polarity_sum = after["running_polarity"].astype(np.int64) - before["running_polarity"]
-        return EventPairs(pixel, before["t_us"].copy(), after["t_us"].copy(), polarity_sum, steps)
+        pixels, pairs = self._count(steps)
+        order = (self.events_before, self.busiest, self.first, self.events)
+        pixel, t0_us, t1_us, polarity_sum = _look_up(random.integers(pairs), steps, pixels, *order)
+        return EventPairs(pixel, t0_us, t1_us, polarity_sum, steps)
 
     def draw_accepted(
         self,
@@ -99,19 +97,19 @@ class PairIndex:
         """
         found: list[EventPairs] = []
         missing = count
-        for _ in range(_ROUNDS):
-            drawn = self.draw(draw_steps(count, longest, random), random)
+        while missing and len(found) < _ROUNDS:
+            # As many as are likely to be enough, in later rounds too: few may be accepted.
+            drawn = self.draw(draw_steps(min(2 * missing, count), longest, random), random)
             found.append(drawn.select(accepted(drawn)).select(slice(missing)))
             missing -= len(found[-1])
-            if not missing:
-                break
         return EventPairs(*(np.concatenate([getattr(part, c.name) for part in found]) for c in fields(EventPairs)))
 
 
 @njit(cache=True, nogil=True)
-def _locate(number, steps, pixels, events_before, busiest, first):
-    """The pixel and the last event of pair ``number`` among those ``steps`` apart, counted along ``busiest``."""
-    pixel, last = np.empty(len(number), np.int64), np.empty(len(number), np.int64)
+def _look_up(number, steps, pixels, events_before, busiest, first, events):
+    """Pixel, times and polarity sum of pair ``number`` among those ``steps`` apart, counted along ``busiest``."""
+    pixel, total = np.empty(len(number), np.int64), np.empty(len(number), np.int64)
+    t0_us, t1_us = np.empty(len(number), np.int64), np.empty(len(number), np.int64)
     for i in range(len(number)):
         low, high = 0, pixels[i] - 1
         while low < high:
@@ -121,8 +119,11 @@ def _locate(number, steps, pixels, events_before, busiest, first):
             else:
                 high = middle - 1
         pixel[i] = busiest[low]
-        last[i] = first[pixel[i]] + steps[i] + number[i] - (events_before[low] - steps[i] * low)
-    return pixel, last
+        last = first[pixel[i]] + steps[i] + number[i] - (events_before[low] - steps[i] * low)
+        before, after = events[last - steps[i]], events[last]
+        t0_us[i], t1_us[i] = before.t_us, after.t_us
+        total[i] = np.int64(after.running_polarity) - before.running_polarity
+    return pixel, t0_us, t1_us, total
 
 
 def index_pairs(
@@ -143,9 +144,9 @@ def index_pairs(
         raise RecordingError(f"none of the {total:,} events has another one at its pixel: no pair to train on")
     in_memory = total * _EVENT.itemsize <= memory_bytes
     events = np.empty(total, _EVENT) if in_memory else _file_backed(total)
+    at_once = total if in_memory else memory_bytes // _EVENT.itemsize
     begin = 0
     while begin < pixels:
-        at_once = pixels if in_memory else memory_bytes // _EVENT.itemsize
         end = max(int(np.searchsorted(first, first[begin] + at_once, side="right")) - 1, begin + 1)
         end = min(end, pixels)
         part = events[first[begin] : first[end]]
@@ -198,21 +199,18 @@ class HeldoutBlocks:
 
 
 class DrawAhead:
-    """Draws batch k + ``stride`` in a thread of its own while batch k is used."""
+    """Draws the next ``ahead`` batches, numbered ``stride`` apart, in threads of its own while one is used."""
 
-    def __init__(self, draw: Callable[[int], EventPairs], stride: int = 1):
-        self._draw, self._stride = draw, stride
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="event pairs")
-        self._ahead: tuple[int, Future[EventPairs]] | None = None
+    def __init__(self, draw: Callable[[int], EventPairs], stride: int = 1, ahead: int = 1):
+        self._draw, self._stride, self._ahead = draw, stride, ahead
+        self._workers = ThreadPoolExecutor(ahead, thread_name_prefix="event pairs")
+        self._drawn: dict[int, Future[EventPairs]] = {}
 
     def batch(self, number: int) -> EventPairs:
-        """Batch ``number``, waited for where it was not the one expected."""
-        expected = self._ahead is not None and self._ahead[0] == number
-        future = self._ahead[1] if expected and self._ahead else self._worker.submit(self._draw, number)
-        pairs = future.result()
-        following = number + self._stride
-        self._ahead = following, self._worker.submit(self._draw, following)
-        return pairs
+        """Batch ``number``, waited for where it was not one of those expected."""
+        wanted = [number + k * self._stride for k in range(self._ahead + 1)]
+        self._drawn = {k: self._drawn.get(k) or self._workers.submit(self._draw, k) for k in wanted}
+        return self._drawn.pop(number).result()
 
 
 def draw_steps(count: int, longest: int, random: np.random.Generator) -> Int64[np.ndarray, "pairs"]:
