@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -12,6 +13,7 @@ from ebarf_ns.evaluation.frames import read_frame
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.plan import Line, plan_for
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
 _HOT_RATIO = 50
@@ -43,6 +45,10 @@ class Summary:
     bounded: bool
     frames: int
     groundtruth: bool
+    distortion: str
+    """Camera model where it distorts, else none."""
+    plan: list[Line]
+    """What training will use on this machine unless flags say otherwise."""
     suspicions: list[str] = field(default_factory=list)
 
 
@@ -98,6 +104,8 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         bounded=scene.bounds is not None,
         frames=len(scene.frames),
         groundtruth=scene.groundtruth is not None,
+        distortion=camera.model if any(camera.distortion) else "none",
+        plan=plan_for(scene, trajectory, events, "cuda" if torch.cuda.is_available() else "cpu"),
     )
 
 
@@ -137,6 +145,13 @@ def print_summary(summary: Summary, folder: Path) -> None:
     for name, value in _lines(summary):
         table.add_row(name, value)
     console.print(table)
+    plan = Table(title="plan of training", title_justify="left")
+    plan.add_column("flag", no_wrap=True)
+    plan.add_column("value", no_wrap=True)
+    plan.add_column("because")
+    for line in summary.plan:
+        plan.add_row(line.flag, str(line.value), line.reason)
+    console.print(plan)
     for suspicion in summary.suspicions:
         console.print(f"[yellow]![/yellow] {suspicion}")
     if not summary.suspicions:
@@ -169,6 +184,10 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
             f"on {threshold[0]}, off {threshold[1]}: threshold loss (Eq. 5)"
             if threshold
             else "unknown: normalised loss (Eq. 6)",
+        ),
+        (
+            "distortion",
+            summary.distortion if summary.distortion == "none" else f"{summary.distortion}: undone once for each pixel",
         ),
         ("bounds", "given" if summary.bounded else "none: unbounded"),
         (

@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
+from ebarf_ns.benchmarks.settings import EngineBenchmark
 from ebarf_ns.errors import EbarfError, one_line_errors
 from ebarf_ns.process import Bounds
 from ebarf_ns.simulation.simulate import Simulation
@@ -164,6 +165,31 @@ class Trajectory:
         self.command.run()
 
 
+@dataclass
+class Bench:
+    """Measure the project itself; engine is its speed beside nerfstudio's and how its cost grows, in half an hour."""
+
+    what: tyro.conf.Positional[Literal["engine"]]
+    settings: tyro.conf.OmitArgPrefixes[EngineBenchmark] = field(default_factory=EngineBenchmark)
+    """What to measure."""
+    output: Path | None = None
+    """Keep the figures in this JSON file."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Measure, print, and keep."""
+        from ebarf_ns.benchmarks.engine import run_engine_benchmark, table, write
+
+        result = run_engine_benchmark(self.settings, _stderr.print)
+        if self.output:
+            write(result, self.output)
+        if self.json:
+            _print_json(result)
+        else:
+            sys.stdout.write(table(result) + "\n")
+
+
 _stderr = Console(stderr=True)
 
 
@@ -188,6 +214,7 @@ def entrypoint() -> None:
                 "inspect": Inspect,
                 "trajectory": Trajectory,
                 "evaluate": Evaluate,
+                "bench": Bench,
             },
             description=__doc__,
         )

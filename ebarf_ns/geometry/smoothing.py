@@ -1,11 +1,17 @@
 """Take out of a trajectory what no hand could have done."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.interpolate import make_smoothing_spline
 
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 _FEWEST = 5  # a cubic smoothing spline needs five knots
 

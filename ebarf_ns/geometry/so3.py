@@ -4,9 +4,16 @@ No function divides by an angle or calls acos: small angles go through Taylor se
 idiom (the unused branch sees a harmless argument, so that its gradient is never NaN), larger ones through atan2.
 """
 
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
 import torch
-from jaxtyping import Float
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Below this squared half-angle the series to second order are exact to float32 and float64 rounding respectively.
 _SERIES_BELOW = {torch.float32: 1e-4, torch.float64: 1e-6}
@@ -54,17 +61,7 @@ def quat_wxyz_log(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
 
 def quat_wxyz_multiply(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Hamilton product: rotate by ``b`` first, then by ``a``."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
+    return _sums_of_products(a, b, _HAMILTON)
 
 
 def quat_wxyz_conjugate(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -85,13 +82,39 @@ def slerp_wxyz(
 
 def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """The rotation matrix of a unit quaternion."""
-    w, x, y, z = quat_wxyz.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=quat_wxyz.dtype, device=quat_wxyz.device)
+    return identity + _sums_of_products(quat_wxyz, quat_wxyz, _ROTATION).unflatten(-1, (3, 3))
+
+
+# Which products of components (w x y z of each) make up each component of the Hamilton product a b ...
+_HAMILTON = (
+    "ww -xx -yy -zz",
+    "wx xw yz -zy",
+    "wy -xz yw zx",
+    "wz xy -yx zw",
+)
+# ... and each entry of the rotation matrix less the identity, twice over.
+_ROTATION = (
+    "-yy -yy -zz -zz", "xy xy -wz -wz", "xz xz wy wy",
+    "xy xy wz wz", "-xx -xx -zz -zz", "yz yz -wx -wx",
+    "xz xz -wy -wy", "yz yz wx wx", "-xx -xx -yy -yy",
+)  # fmt: skip
+
+
+def _sums_of_products(a: Tensor, b: Tensor, sums: tuple[str, ...]) -> Tensor:
+    """One product with a constant matrix, where written-out sums would take dozens of operations a batch."""
+    products = (a[..., :, None] * b[..., None, :]).flatten(-2)
+    return products @ _matrix_of(sums, a.dtype, a.device)
+
+
+@lru_cache
+def _matrix_of(sums: tuple[str, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    matrix = torch.zeros(16, len(sums), dtype=dtype, device=device)
+    for column, terms in enumerate(sums):
+        for term in terms.split():
+            first, second = ("wxyz".index(letter) for letter in term[-2:])
+            matrix[4 * first + second, column] += -1 if term[0] == "-" else 1
+    return matrix
 
 
 def rotate(quat_wxyz: Float[Tensor, "*batch 4"], vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

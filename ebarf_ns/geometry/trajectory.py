@@ -4,15 +4,18 @@ Poses are camera-to-world, OpenCV axes (x right, y down, z forward). Times are i
 subtraction that makes them a fraction of a keyframe interval.
 """
 
-from typing import Literal, NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int64
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from ebarf_ns.errors import TrajectoryError
 from ebarf_ns.geometry.so3 import quat_wxyz_exp, quat_wxyz_multiply, quat_wxyz_to_matrix, rotate, slerp_wxyz
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int64
 
 Interpolation = Literal["linear", "cubic"]
 
@@ -27,7 +30,7 @@ class Poses(NamedTuple):
         """[R | t]."""
         return torch.cat([quat_wxyz_to_matrix(self.quat_wxyz), self.position[..., None]], dim=-1)
 
-    def compose(self, local: "Poses") -> "Poses":
+    def compose(self, local: Poses) -> Poses:
         """``self · local``: apply ``local`` in the frame of these poses."""
         return Poses(
             self.position + rotate(self.quat_wxyz, local.position),
@@ -64,6 +67,19 @@ def within_span(t_us: Int64[Tensor, "*batch"], keyframe_t_us: Int64[Tensor, "key
     return (t_us >= keyframe_t_us[0]) & (t_us <= keyframe_t_us[-1])
 
 
+def intervals(
+    keyframe_t_us: Int64[Tensor, "keyframes"], t_us: Int64[Tensor, "*batch"]
+) -> tuple[Int64[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Between which keyframes each time lies: the left one's number, and the fraction of the way to the next, float64.
+
+    Times outside the span count as the nearer end.
+    """
+    t_us = t_us.clamp(keyframe_t_us[0], keyframe_t_us[-1])
+    left = (torch.searchsorted(keyframe_t_us, t_us, right=True) - 1).clamp(0, len(keyframe_t_us) - 2)
+    interval_us = keyframe_t_us[left + 1] - keyframe_t_us[left]
+    return left, (t_us - keyframe_t_us[left]).double() / interval_us.double()
+
+
 def interpolate(
     keyframe_t_us: Int64[Tensor, "keyframes"],
     keyframes: Poses,
@@ -74,15 +90,14 @@ def interpolate(
 
     Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
     """
-    t_us = t_us.clamp(keyframe_t_us[0], keyframe_t_us[-1])
-    left = (torch.searchsorted(keyframe_t_us, t_us, right=True) - 1).clamp(0, len(keyframe_t_us) - 2)
-    interval_us = keyframe_t_us[left + 1] - keyframe_t_us[left]
+    left, exact_fraction = intervals(keyframe_t_us, t_us)
     dtype = keyframes.position.dtype
-    fraction = ((t_us - keyframe_t_us[left]).double() / interval_us.double()).to(dtype)
+    fraction = exact_fraction.to(dtype)
     a, b = keyframes.position[left], keyframes.position[left + 1]
     position = a + fraction[..., None] * (b - a)
     if translation == "cubic":
         curvature = _natural_spline_curvature(keyframe_t_us, keyframes.position)
+        interval_us = keyframe_t_us[left + 1] - keyframe_t_us[left]
         interval_s = (interval_us.double() * 1e-6).to(dtype)[..., None]
         u = fraction[..., None]
         position = position + interval_s**2 / 6 * (
@@ -116,6 +131,8 @@ class _SolveTridiagonal(torch.autograd.Function):
 
 
 def _solve_spline_system(interval_s: Tensor, right: Tensor) -> Tensor:
+    from scipy.linalg import solveh_banded
+
     # First and last row say that the curvature is zero there.
     upper_bands = torch.zeros(2, len(interval_s) + 1, dtype=torch.float64)
     upper_bands[0, 2:-1] = interval_s[1:-1]

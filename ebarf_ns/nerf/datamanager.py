@@ -75,8 +75,8 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: EventDataManager)
     dataparser: DataParserConfig = field(default_factory=EbarfDataParserConfig)
-    train_num_rays_per_batch: int = 1024
-    """Rays per step: two for each event pair."""
+    train_num_rays_per_batch: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Rays per step, two for each event pair; None: as planned."""
     eval_num_rays_per_batch: int = 8192
     """Rays of the held-out pairs: two for each."""
     longest_pair: int = 30
@@ -98,7 +98,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     def setup_train(self) -> None:
         """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
-        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
+        # Only a training asks for batches, and has planned them; ns-export says how many rays it wants.
+        rays = self.config.train_num_rays_per_batch or 1024
+        self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
         if self.test_mode == "val":
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
             CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
@@ -141,7 +143,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def _training_batches(self) -> DrawAhead:
-        return DrawAhead(self._draw_training_pairs, self.world_size)
+        ahead = 1 if torch.device(self.device).type == "cpu" else 4
+        return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
 
     def _draw_training_pairs(self, batch: int) -> EventPairs:
         count = self.get_train_rays_per_batch() // 2

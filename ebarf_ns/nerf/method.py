@@ -52,7 +52,7 @@ def _trainer(
 def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConfig:
     """The seed paper's method; its baseline is the same with the poses frozen."""
     model = EbarfModelConfig(
-        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False),
+        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False, keyframe_stride=1),
         loss="normalized",
         brightness="lin_log",
         intensity_range="unit",
@@ -63,8 +63,11 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         grid_features=2,
         grid_coarsest=16,
         grid_finest=512,
+        grid_table_size_log2=17,
+        precision="float32",
     )
-    return _trainer(method_name, EventDataManagerConfig(longest_pair=1), model, field_rate=5e-3, pose_rate_px=0.1)
+    datamanager = EventDataManagerConfig(longest_pair=1, train_num_rays_per_batch=1024)
+    return _trainer(method_name, datamanager, model, field_rate=5e-3, pose_rate_px=0.1)
 
 
 ebarf = MethodSpecification(

@@ -1,7 +1,7 @@
 """The picture of the method: event pair, two poses, two rays, two intensities, one difference, one loss."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -11,25 +11,23 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 
+from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss
-from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField, fastest_precision
+from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
 from ebarf_ns.radiance.hash_grid import HashGridShape
-from ebarf_ns.radiance.ray_sampling import (
-    DensityGrid,
-    Rays,
-    coarse_edges,
-    composite,
-    leave_box,
-    resample,
-    weights_of,
-)
+from ebarf_ns.radiance.ray_sampling import Rays
+from ebarf_ns.radiance.renderer import Renderer, Sampling
 from ebarf_ns.scene import Scene
 
-# Without bounds, 400 times the trajectory's radius; beyond it contracted space is a hundredth of a cell thick.
-_FAR_UNBOUNDED = 100.0
-_BACKGROUND = 0.5
+T = TypeVar("T")
+
+
+def _planned(value: T | None) -> T:
+    """A value that the trainer's plan has filled in."""
+    assert value is not None
+    return value
 
 
 @dataclass
@@ -39,36 +37,40 @@ class EbarfModelConfig(ModelConfig):
     _target: type = field(default_factory=lambda: EbarfModel)
     eval_num_rays_per_chunk: int = 4096
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
-    loss: Literal["auto", "threshold", "normalized"] = "auto"
-    """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; auto takes Eq. 5 where scene.json has them."""
+    loss: Literal["threshold", "normalized"] | None = None
+    """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; None: as planned."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
     """Of the field: unit is a sigmoid, positive an exponential."""
     view_dependent: bool = False
     """Let intensity depend on the viewing direction."""
-    grid_levels: int = 8
+    contract: bool | None = None
+    """Let the grid hold all of space, contracted, or the scene's bounds alone; None: as planned."""
+    grid_levels: int | None = None
+    """Resolutions of the hash grid; None: as planned."""
     grid_features: int = 4
     grid_coarsest: int = 8
-    grid_finest: int = 192
-    """Cells per side of the finest level: about twice the scene's size over a pixel's footprint."""
-    grid_table_size_log2: int = 17
+    grid_finest: int | None = None
+    """Cells per side of the finest level; None: as planned."""
+    grid_table_size_log2: int | None = None
+    """Rows of the table a level; None: as planned."""
     sampling: Literal["importance", "uniform"] = "importance"
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
-    samples: int = 24
-    """Points per ray at which the field is asked."""
+    samples: int | None = None
+    """Points per ray at which the field is asked; None: as planned."""
     coarse_samples: int = 128
     """Points per ray at which the remembered density is looked up for importance sampling."""
     uniform_share: float = 0.1
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
-    density_cells: int = 96
-    """Cells per side of the remembered density."""
+    density_cells: int | None = None
+    """Cells per side of the remembered density; None: as planned."""
     near: float = 0.05
     """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
     density_bias: float = 0.0
     """Log density at the start of training."""
-    precision: Precision | Literal["auto"] = "auto"
-    """Of the MLPs' products; auto is bfloat16 where the processor multiplies it natively, else float32."""
+    precision: Precision | None = None
+    """Of the MLPs' products; None: as planned."""
 
 
 class EbarfModel(Model):
@@ -82,27 +84,36 @@ class EbarfModel(Model):
         config, scene = self.config, self.kwargs["metadata"]["scene"]
         assert isinstance(scene, Scene)
         threshold = scene.contrast_threshold
-        self.normalized = config.loss == "normalized" or (config.loss == "auto" and threshold is None)
+        if config.loss == "threshold" and threshold is None:
+            path = scene.folder / "scene.json"
+            raise TrainingError(f"{path}: no contrast_threshold, which --pipeline.model.loss threshold needs")
+        self.normalized = config.loss == "normalized"
         # Without thresholds, polarities are compared in units of one common threshold.
         self.thresholds = (threshold.on, threshold.off) if threshold and not self.normalized else (1.0, 1.0)
-        bounded = scene.bounds is not None
         shape = HashGridShape(
-            config.grid_levels,
-            config.grid_features,
-            config.grid_coarsest,
-            config.grid_finest,
-            config.grid_table_size_log2,
+            levels=_planned(config.grid_levels),
+            features=config.grid_features,
+            coarsest=config.grid_coarsest,
+            finest=_planned(config.grid_finest),
+            table_size_log2=_planned(config.grid_table_size_log2),
         )
-        self.field = RadianceField(
+        field = RadianceField(
             shape,
-            bounded,
+            not _planned(config.contract),
             config.view_dependent,
             config.intensity_range,
             density_bias=config.density_bias,
-            precision=fastest_precision(self.kwargs["device"]) if config.precision == "auto" else config.precision,
+            precision=_planned(config.precision),
         )
-        if config.sampling == "importance":
-            self.density_grid = DensityGrid(config.density_cells, bounded)
+        sampling = Sampling(
+            _planned(config.samples),
+            config.near,
+            config.sampling,
+            config.coarse_samples,
+            config.uniform_share,
+            _planned(config.density_cells),
+        )
+        self.renderer = Renderer(field, sampling)
         self.camera_optimizer: TrajectoryOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data,
             device="cpu",
@@ -115,27 +126,24 @@ class EbarfModel(Model):
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Two groups: fields, and camera_opt for the keyframe corrections."""
-        groups = {"fields": list(self.field.parameters())}
+        groups = {"fields": list(self.renderer.parameters())}
         self.camera_optimizer.get_param_groups(groups)
         return groups
 
     def begin_step(self, step: int, seed: int) -> None:
         """Random numbers are a function of seed and step, so that a resumed run continues as if never stopped."""
         self.random.manual_seed(seed * 1_000_003 + step)
-        if self.config.sampling == "importance" and (step < 16 or step % 8 == 0):
-            self.density_grid.refresh(self.field, step if step < 16 else step // 8, self.random)
+        self.renderer.begin_step(step, self.random)
 
     def restart_field(self) -> None:
         """Forget the field and keep the poses."""
-        self.field.reset()
-        if self.config.sampling == "importance":
-            self.density_grid.reset()
+        self.renderer.reset()
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Rendered intensity, depth and accumulation, and a grey picture of the log brightness for people."""
         self.camera_optimizer.apply_to_raybundle(ray_bundle)
         rays = Rays(ray_bundle.origins, ray_bundle.directions)
-        rendered = composite(self.field, rays, self.sample_edges(rays), _BACKGROUND)
+        rendered = self.renderer(rays, self.random if self.training else None)
         brightness = log_brightness(rendered.intensity, self.config.brightness)
         if self.training:
             self._follow_display_range(brightness.detach())
@@ -163,34 +171,6 @@ class EbarfModel(Model):
         metrics = {"accumulation": outputs["accumulation"].detach().mean()}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
-
-    def sample_edges(self, rays: Rays) -> Float[Tensor, "rays samples+1"]:
-        """Where to ask the field; in training the two rays of a pair share distances and jitter.
-
-        The loss looks at their difference: whatever differs between the two but the pose is noise in exactly that.
-        """
-        config, count = self.config, len(rays.origin)
-        with torch.no_grad():
-            far = leave_box(rays) if self.field.bounded else torch.full_like(rays.origin[:, 0], _FAR_UNBOUNDED)
-            if self.training:
-                far = far.view(2, -1).amax(0).repeat(2)
-                jitter = torch.rand(count // 2, 1, generator=self.random).to(far.device).repeat(2, 1) - 0.5
-            else:
-                jitter = torch.zeros(count, 1, device=far.device)
-            importance = config.sampling == "importance"
-            coarse = config.coarse_samples if importance else config.samples
-            edges = coarse_edges(config.near, far, coarse, self.field.bounded)
-            if not importance:
-                weights = torch.ones_like(edges[:, 1:])
-                return resample(edges, weights, config.samples, jitter)
-            middle = (edges[:, 1:] + edges[:, :-1]) / 2
-            point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
-            weights = weights_of(self.density_grid.lookup(point), edges)
-            if self.training:
-                weights = weights.view(2, -1, coarse).mean(0).repeat(2, 1)
-            # What passes through the scene is spread evenly too.
-            spread = config.uniform_share + (1 - weights.sum(-1, keepdim=True)).clamp_min(0)
-            return resample(edges, weights + spread / coarse, config.samples, jitter)
 
     def _follow_display_range(self, brightness: Float[Tensor, "rays"]) -> None:
         low, high = torch.quantile(brightness, torch.tensor([0.02, 0.98], device=brightness.device))

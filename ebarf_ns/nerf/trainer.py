@@ -23,9 +23,13 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from ebarf_ns.errors import TrainingError, one_line_errors
 from ebarf_ns.evaluation.report import write_report
+from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.files import whole_file
-from ebarf_ns.geometry.trajectory_file import write_tum
+from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.nerf.pipeline import EbarfPipeline
+from ebarf_ns.plan import apply_plan, plan_for
+from ebarf_ns.radiance.hash_grid import fastest_carrier
+from ebarf_ns.scene import read_scene
 
 _SKIPPED_IN_A_ROW = 10
 
@@ -119,12 +123,28 @@ class EbarfTrainer(Trainer):
                 value = getattr(self.config, flag)
                 if value is not None and not value > 0:
                     raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected more than 0")
+            self._plan()
             super().setup(test_mode)
             if self.progress() >= 1:
                 raise TrainingError(
                     f"the loaded run has used its budget ({self.steps_done} steps, {self.train_seconds:.0f} s); "
                     "expected a larger --max-num-iterations or --max-train-seconds to go on"
                 )
+
+    def _plan(self) -> None:
+        """Fill in what the configuration leaves to the plan, and keep it with the run."""
+        datamanager = self.config.pipeline.datamanager
+        folder = datamanager.data or datamanager.dataparser.data  # pyright: ignore[reportAttributeAccessIssue]
+        scene = read_scene(Path(folder))
+        events, _, _ = RecordingFile(scene.events, scene.camera.width, scene.camera.height).span()
+        device = "cuda" if self.device.startswith("cuda") else "cpu"
+        self.plan = apply_plan(plan_for(scene, read_tum(scene.trajectory), events, device), self.config)
+        self._keep_plan()
+
+    @check_main_thread
+    def _keep_plan(self) -> None:
+        with whole_file(self.base_dir / "config.yml") as temporary:
+            temporary.write_text(yaml.dump(self.config), encoding="utf-8")
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """One optimizer for each parameter group."""
@@ -225,6 +245,8 @@ class EbarfTrainer(Trainer):
             "scene": str(scene.folder.resolve()),
             "scene_digest": _digest((scene.folder / "scene.json").read_bytes() + scene.trajectory.read_bytes()),
             "config_digest": _digest(yaml.dump(configuration).encode()),
+            "hash_grid": fastest_carrier(torch.zeros(0, 3, device=self.device)),
+            "plan": {line.field: {"value": line.value, "reason": line.reason} for line in self.plan},
         }
 
     @check_main_thread

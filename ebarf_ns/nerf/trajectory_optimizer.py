@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
-from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate
+from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate, intervals
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
 
 
@@ -25,12 +25,14 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     """Refine every keyframe, or keep the trajectory as it came."""
     smooth: bool = True
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
+    keyframe_stride: int | None = None
+    """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
     interpolation: Interpolation = "linear"
     """Of positions between keyframes: linear (Eq. 3), or the natural cubic spline of the reference implementation."""
 
 
 class TrajectoryOptimizer(CameraOptimizer):
-    """Keyframe poses with a zero-initialised correction (rotation, translation) each, in the camera's frame.
+    """Keyframe poses with zero-initialised corrections (rotation, translation) in the camera's frame.
 
     Corrections are counted in pixels: one is the rotation, or the translation at unit distance, that moves the image
     by a pixel, so that one learning rate suits cameras of any focal length. The model holds this module under the
@@ -62,8 +64,11 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
         self.start_position: Tensor
         self.start_quat_wxyz: Tensor
+        knots = _every(config.keyframe_stride or 1, len(keyframes.t_us))
+        self.register_buffer("knot_t_us", keyframes.t_us[knots].clone(), persistent=False)
+        self.knot_t_us: Tensor
         if config.mode == "refine":
-            self.correction = nn.Parameter(torch.zeros(len(keyframes.t_us), 6))
+            self.correction = nn.Parameter(torch.zeros(len(knots), 6))
 
     def initial(self) -> Poses:
         """The keyframes as they came."""
@@ -72,7 +77,13 @@ class TrajectoryOptimizer(CameraOptimizer):
     def keyframes(self) -> Poses:
         """The keyframes as corrected so far."""
         start = Poses(self.start_position, self.start_quat_wxyz)
-        return corrected(start, self.pixel_rad * self.correction) if self.config.mode == "refine" else start
+        if self.config.mode == "off":
+            return start
+        correction = self.correction
+        if len(self.knot_t_us) < len(self.keyframe_t_us):
+            left, fraction = intervals(self.knot_t_us, self.keyframe_t_us)
+            correction = torch.lerp(correction[left], correction[left + 1], fraction.to(correction)[:, None])
+        return corrected(start, self.pixel_rad * correction)
 
     def trajectory(self) -> Trajectory:
         """The corrected keyframes and their times, detached."""
@@ -131,3 +142,9 @@ class TrajectoryOptimizer(CameraOptimizer):
         """The corrections, under nerfstudio's name for camera parameters."""
         if self.config.mode == "refine":
             param_groups["camera_opt"] = [self.correction]
+
+
+def _every(stride: int, count: int) -> Int[Tensor, "knots"]:
+    """Every ``stride``-th of ``count``, and the last."""
+    last = torch.tensor([count - 1])
+    return torch.cat([torch.arange(0, count - 1, stride), last])

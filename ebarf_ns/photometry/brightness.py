@@ -1,11 +1,15 @@
 """From rendered intensity to log brightness, finite with finite gradients for every intensity from 0 up."""
 
+from __future__ import annotations
+
 import math
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 BrightnessKind = Literal["lin_log", "log"]
 LIN_LOG_KNEE = 20.0

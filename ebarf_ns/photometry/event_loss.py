@@ -1,8 +1,14 @@
 """What the rendered change of log brightness should have been: the losses of Eq. 5 and Eq. 6."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import torch
-from jaxtyping import Float, Int64
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int64
 
 
 def reported_change(

@@ -1,12 +1,16 @@
 """Where along a ray the field is asked, and how the answers add up (Max 1995; Mildenhall et al. 2020)."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from ebarf_ns.radiance.field import RadianceField, contract
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 class Rays(NamedTuple):
@@ -92,6 +96,33 @@ class DensityGrid(nn.Module):
         scaled = ((point / self.half_side + 1) * (self.cells / 2)).long().clamp(0, self.cells - 1)
         x, y, z = scaled.unbind(-1)
         return self.density[x + self.cells * (y + self.cells * z)]
+
+
+def importance_edges(
+    grid: DensityGrid,
+    rays: Rays,
+    near: float,
+    far: Float[Tensor, "rays"],
+    coarse: int,
+    uniform_share: float,
+    samples: int,
+    jitter: Float[Tensor, "rays 1"],
+    pairs: bool,
+) -> Float[Tensor, "rays samples+1"]:
+    """Edges of intervals as dense as the remembered density makes a ray's light come from them.
+
+    ``uniform_share`` of them are spread evenly. With ``pairs``, rays k and k + n/2 share edges, by their mean weights;
+    they must come with the same ``far`` and ``jitter``.
+    """
+    edges = coarse_edges(near, far, coarse, grid.half_side == 1)
+    middle = (edges[:, 1:] + edges[:, :-1]) / 2
+    point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
+    weights = weights_of(grid.lookup(point), edges)
+    if pairs:
+        weights = weights.unflatten(0, (2, -1)).mean(0).repeat(2, 1)
+    # What passes through the scene is spread evenly too.
+    spread = uniform_share + (1 - weights.sum(-1, keepdim=True)).clamp_min(0)
+    return resample(edges, weights + spread / coarse, samples, jitter)
 
 
 def composite(

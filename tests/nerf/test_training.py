@@ -25,7 +25,7 @@ def config(scene: Path, output: Path, name: str = "ebarf", steps: int = 12) -> E
     made.max_num_iterations, made.evaluations, made.machine.device_type = steps, 2, "cpu"
     model = made.pipeline.model
     model.grid_table_size_log2, model.samples, model.density_cells = 10, 8, 16  # pyright: ignore[reportAttributeAccessIssue]
-    model.grid_levels, model.grid_finest = 4, 32  # pyright: ignore[reportAttributeAccessIssue]
+    model.grid_levels, model.grid_finest, model.precision = 4, 32, "float32"  # pyright: ignore[reportAttributeAccessIssue]
     datamanager = made.pipeline.datamanager
     datamanager.train_num_rays_per_batch, datamanager.eval_num_rays_per_batch = 128, 512  # pyright: ignore[reportAttributeAccessIssue]
     return made
@@ -196,7 +196,7 @@ def test_pairs_share_distances_and_jitter(tiny_scene: Path, tmp_path: Path):
     model.camera_optimizer.apply_to_raybundle(bundle)
     from ebarf_ns.radiance.ray_sampling import Rays
 
-    before, after = model.sample_edges(Rays(bundle.origins, bundle.directions)).chunk(2)
+    before, after = model.renderer.sample_edges(Rays(bundle.origins, bundle.directions), model.random).chunk(2)
     assert torch.equal(before, after)
 
 
@@ -204,11 +204,13 @@ MODEL_CHANGES = {
     "loss": "normalized", "brightness": "lin_log", "intensity_range": "unit", "view_dependent": True, "grid_levels": 5,
     "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
     "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3, "density_bias": 1.0,
+    "contract": True, "precision": "bfloat16",
 }  # fmt: skip
+POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
 DATA_CHANGES = {"train_num_rays_per_batch": 64, "longest_pair": 3, "heldout_share": 0.2, "seed": 5}
 
 
-@pytest.mark.parametrize("key", [*MODEL_CHANGES, *DATA_CHANGES, "smooth", "interpolation", "mode"])
+@pytest.mark.parametrize("key", [*MODEL_CHANGES, *DATA_CHANGES, *POSE_CHANGES])
 def test_every_field_of_the_configuration_changes_the_run(tiny_scene: Path, tmp_path: Path, key: str):
     losses = []
     for change in (False, True):
@@ -217,9 +219,8 @@ def test_every_field_of_the_configuration_changes_the_run(tiny_scene: Path, tmp_
             setattr(made.pipeline.model, key, MODEL_CHANGES[key])
         if change and key in DATA_CHANGES:
             setattr(made.machine if key == "seed" else made.pipeline.datamanager, key, DATA_CHANGES[key])
-        if change and key in ("smooth", "interpolation", "mode"):
-            value = {"smooth": False, "interpolation": "cubic", "mode": "off"}[key]
-            setattr(made.pipeline.model.camera_optimizer, key, value)  # pyright: ignore[reportAttributeAccessIssue]
+        if change and key in POSE_CHANGES:
+            setattr(made.pipeline.model.camera_optimizer, key, POSE_CHANGES[key])  # pyright: ignore[reportAttributeAccessIssue]
         torch.manual_seed(0)
         ready = made.setup(local_rank=0, world_size=1)
         ready.setup()

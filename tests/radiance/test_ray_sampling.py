@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from ebarf_ns.radiance import ray_sampling_numba
 from ebarf_ns.radiance.field import RadianceField
 from ebarf_ns.radiance.hash_grid import HashGridShape
 from ebarf_ns.radiance.ray_sampling import (
@@ -10,6 +11,7 @@ from ebarf_ns.radiance.ray_sampling import (
     Rays,
     coarse_edges,
     composite,
+    importance_edges,
     leave_box,
     resample,
     weights_of,
@@ -121,3 +123,28 @@ def test_gradient_moves_the_ray_towards_the_light():
     rendered = composite(field, rays, coarse_edges(0.05, leave_box(rays), 16, True), 0.5)
     (gradient,) = torch.autograd.grad(rendered.intensity.sum(), origin)
     assert torch.isfinite(gradient).all() and gradient.abs().sum() > 0
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+@pytest.mark.parametrize("pairs", [True, False])
+def test_samples_placed_in_one_pass_are_those_of_the_reference(bounded: bool, pairs: bool):
+    torch.manual_seed(0)
+    grid = DensityGrid(16, bounded)
+    grid.density.copy_(torch.rand(16**3) ** 6 * 50)
+    rays = Rays(torch.rand(40, 3) - 0.5, torch.nn.functional.normalize(torch.randn(40, 3), dim=-1))
+    far = leave_box(rays) if bounded else torch.full((40,), 50.0)
+    far[3] = far[23] = 0.0
+    jitter = torch.rand(40, 1) - 0.5
+    if pairs:
+        far, jitter = far.view(2, -1).amax(0).repeat(2), jitter[:20].repeat(2, 1)
+    ours = ray_sampling_numba.importance_edges(grid, rays, 0.05, far, 64, 0.1, 24, jitter, pairs)
+    theirs = importance_edges(grid, rays, 0.05, far, 64, 0.1, 24, jitter, pairs)
+    # A point on a cell's border may fall to either side.
+    assert ((ours - theirs).abs() < 2e-3 * far[:, None].clamp_min(0.1)).float().mean() > 0.98
+    assert (ours.diff(dim=-1) >= 0).all() and (not pairs or torch.equal(ours[:20], ours[20:]))
+
+
+def test_no_rays_are_no_samples():
+    rays, grid = Rays(torch.zeros(0, 3), torch.zeros(0, 3)), DensityGrid(16, bounded=True)
+    for place in (importance_edges, ray_sampling_numba.importance_edges):
+        assert place(grid, rays, 0.05, torch.zeros(0), 64, 0.1, 24, torch.zeros(0, 1), False).shape == (0, 25)

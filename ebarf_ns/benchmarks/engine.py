@@ -1,0 +1,434 @@
+"""How fast the engine is, measured side by side in one run, and how its cost grows with the work.
+
+What is ours needs only torch, numpy, numba and h5py, so that ``python -m ebarf_ns.benchmarks.engine`` also runs on a
+bare machine with a GPU; what it is compared with is measured where nerfstudio is importable, and left out where not.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import date
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from ebarf_ns.benchmarks.settings import PARTS, EngineBenchmark, Part
+from ebarf_ns.events.pairs import HeldoutBlocks, PairIndex, batch_random, index_pairs
+from ebarf_ns.events.recording import Recording
+from ebarf_ns.files import whole_file
+from ebarf_ns.geometry.so3 import quat_wxyz_exp, rotate
+from ebarf_ns.geometry.trajectory import Poses, corrected, interpolate
+from ebarf_ns.photometry.brightness import log_brightness
+from ebarf_ns.photometry.event_loss import reported_change, threshold_loss
+from ebarf_ns.radiance.field import RadianceField, fastest_precision
+from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape, encode_reference, fastest_carrier
+from ebarf_ns.radiance.ray_sampling import Rays
+from ebarf_ns.radiance.renderer import Renderer, Sampling
+
+WIDTH, HEIGHT, FOCAL_PX = 128, 96, 110.0
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number and, where there is one, what it should reach."""
+
+    what: str
+    value: float | None
+    unit: str
+    at_least: float | None = None
+    at_most: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the target is met; empty where there is none."""
+        if self.value is None:
+            return "not measured"
+        if self.at_least is not None:
+            return "reached" if self.value >= self.at_least else "missed"
+        if self.at_most is not None:
+            return "reached" if self.value <= self.at_most else "missed"
+        return ""
+
+    @property
+    def target(self) -> str:
+        """For a person."""
+        if self.at_least is not None:
+            return f">= {self.at_least:g}"
+        return f"<= {self.at_most:g}" if self.at_most is not None else ""
+
+
+def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Measure everything asked for; returns what :func:`table` shows, ready for JSON."""
+    figures = []
+    for part in settings.parts:
+        say(f"measuring {part}")
+        for figure in getattr(_Engine(settings), part)():
+            figures.append({**vars(figure), "verdict": figure.verdict})
+            say(f"  {figure.what}: {_shown(figure.value)} {figure.unit} {figure.target} {figure.verdict}")
+    return {
+        "date": date.today().isoformat(),
+        "machine": machine(),
+        "carrier": fastest_carrier(torch.zeros(0, 3, device=_device())),
+        "precision": fastest_precision(_device()),
+        "versions": {"torch": torch.__version__, "numpy": np.__version__},
+        "quick": settings.quick,
+        "figures": figures,
+    }
+
+
+class _Engine:
+    """One method for each part, which yields its figures as they come."""
+
+    def __init__(self, settings: EngineBenchmark):
+        self.quick, self.seeds, self.seconds = settings.quick, settings.seeds, settings.seconds
+        self._repetitions = 2 if settings.quick else 9
+
+    def hash_grid(self) -> Iterator[Figure]:
+        """Forward and backward with position gradients: the fastest carrier, the torch reference, nerfstudio's."""
+        count = 1_000 if self.quick else 100_000
+        shape = HashGridShape(levels=16, features=2, coarsest=16, finest=1024, table_size_log2=19)
+        grid = HashGrid(shape).to(_device())
+        point = torch.rand(count, 3, device=_device())
+        name = f"hash grid 16 x 2, {count:,} points, forward + backward"
+        ours = self._both_ways(grid, point, list(grid.parameters()))
+        yield Figure(f"{name}, {fastest_carrier(point)}", 1e3 * ours, "ms")
+        reference = self._both_ways(
+            lambda at: encode_reference(at, grid.table, grid.lattice), point, list(grid.parameters()), few=True
+        )
+        yield Figure(f"{name}, torch reference", 1e3 * reference, "ms")
+        if _device() == "cuda":
+            # Each corner is read, read again and added to; points and features come and go once.
+            moved = count * 16 * (8 * 2 * 4 * 4 + 2 * 2 * 4) + count * 3 * 4 * 3
+            yield Figure(f"{name}, memory-bandwidth floor", 1e3 * moved / _copy_bandwidth(), "ms")
+        if find_spec("nerfstudio"):
+            from ebarf_ns.nerf.comparison import hash_encoding
+
+            theirs_encode, parameters = hash_encoding(shape, _device())
+            theirs = self._both_ways(theirs_encode, point, parameters, few=True)
+            yield Figure(f"{name}, nerfstudio's HashEncoding (torch)", 1e3 * theirs, "ms")
+            yield Figure("hash grid against nerfstudio's", theirs / ours, "times", at_least=12)
+
+    def _both_ways(self, encode: Callable, point: torch.Tensor, parameters: list, few: bool = False) -> float:
+        point = point.clone().requires_grad_()
+        weight = torch.rand_like(encode(point).detach())
+
+        def once() -> None:
+            torch.autograd.grad(encode(point), [*parameters, point], weight)
+
+        return _seconds(once, 3 if few else self._repetitions)
+
+    def step(self) -> Iterator[Figure]:
+        """Training steps without nerfstudio around them, and the sampler beside them."""
+        index = _index(10_000 if self.quick else 1_000_000)
+        for pairs in (512,) if _device() == "cpu" or self.quick else (4096, 16384, 65536):
+            step = _Step(index, pairs)
+            seconds = _seconds(step.once, self._repetitions)
+            yield Figure(f"step of {pairs:,} pairs", 1e3 * seconds, "ms")
+            yield Figure(f"pairs per second, {pairs:,} a step", pairs / seconds, "pairs/s")
+            drawn = _seconds(lambda step=step: step.draw(1), 5 * self._repetitions)
+            # On a GPU, four threads draw ahead.
+            at_once = 1 if _device() == "cpu" else 4
+            yield Figure(
+                f"sampler's speed over the step's, {pairs:,} pairs", at_once * seconds / drawn, "times", at_least=5
+            )
+
+    def scaling(self) -> Iterator[Figure]:
+        """Exponent of the seconds a step takes as one kind of work grows: 1 is linear, 0 is flat."""
+        index = _index(10_000 if self.quick else 1_000_000)
+        sweeps: dict[str, tuple[list[int], Callable[[int], _Step]]] = {
+            "pairs per batch": ([256, 1024, 4096, 16384], lambda n: _Step(index, n)),
+            "samples": ([8, 16, 32, 64], lambda n: _Step(index, samples=n)),
+            "levels": ([4, 8, 16], lambda n: _Step(index, levels=n)),
+            "keyframes": ([10, 100, 1_000, 10_000], lambda n: _Step(index, keyframes=n)),
+            "events": ([100_000, 1_000_000, 10_000_000, 100_000_000], lambda n: _Step(_index(n))),
+        }
+        for name, (all_sizes, make) in sweeps.items():
+            sizes = all_sizes[:2] if self.quick else all_sizes
+            seconds = []
+            for size in sizes:
+                seconds.append(_seconds(make(size).once, self._repetitions))
+                yield Figure(f"step with {size:,} {name}", 1e3 * seconds[-1], "ms")
+            slope = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+            flat = name in ("keyframes", "events")
+            yield Figure(f"growth with {name}", slope, "exponent", at_most=0.1 if flat else 1.05)
+
+    def frame(self) -> Iterator[Figure]:
+        """A DAVIS346's frame."""
+        width, height = (34, 26) if self.quick else (346, 260)
+        renderer = _renderer(24, 8).eval()
+        x, y = torch.meshgrid(torch.arange(width) / width - 0.5, torch.arange(height) / width - 0.4, indexing="xy")
+        direction = torch.stack([x, y, torch.ones_like(x)], dim=-1).flatten(0, 1).to(_device())
+        rays = Rays(torch.zeros_like(direction), torch.nn.functional.normalize(direction, dim=-1))
+
+        @torch.no_grad()
+        def once() -> None:
+            for start in range(0, len(direction), 4096):
+                renderer(Rays(*(column[start : start + 4096] for column in rays)))
+
+        yield Figure(f"a {width} x {height} frame", _seconds(once, self._repetitions), "s", at_most=1.5)
+
+    def index(self) -> Iterator[Figure]:
+        """An index of many events from a file, in memory and in a file of its own."""
+        events = 100_000 if self.quick else 100_000_000
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "events.h5"
+            _write_events(path, events)
+            for place, memory_gib in (
+                ("in memory", 1e6),
+                ("in a file, with an eighth of the memory", events * 12 / 2**33),
+            ):
+                made = _in_own_process("index", str(path), str(memory_gib))
+                name = f"index of {events:,} events, {place}"
+                yield Figure(name, made["seconds"], "s", at_most=90)
+                yield Figure(f"{name}: peak memory", made["peak_gib"], "GiB", at_most=6)
+                yield Figure(f"{name}: a batch of 512 pairs", made["batch_ms"], "ms")
+
+    def nerfacto(self) -> Iterator[Figure]:
+        """Training rays per second of our default method, and of stock nerfacto in torch."""
+        if not find_spec("nerfstudio"):
+            yield Figure("training rays per second against nerfacto", None, "times")
+            return
+        from ebarf_ns.nerf.comparison import ebarf_rays_per_second, nerfacto_rays_per_second
+
+        with tempfile.TemporaryDirectory() as folder:
+            scene = _demo_scene(Path(folder), 0, self.quick)
+            ours = ebarf_rays_per_second(scene, Path(folder), 20 if self.quick else 200)
+        yield Figure("ebarf, training rays per second", ours, "rays/s")
+        for name, same, target in (
+            ("nerfacto", False, 60),
+            ("nerfacto cut down to the same grid and samples", True, 8),
+        ):
+            theirs = nerfacto_rays_per_second(same, 1 if self.quick else 3)
+            yield Figure(f"{name}, training rays per second", theirs, "rays/s")
+            yield Figure(f"ebarf against {name}", ours / theirs, "times", at_least=target)
+
+    def training(self) -> Iterator[Figure]:
+        """Trainings on the demo scene: how soon they are within 1 dB of where they end, and what memory they take."""
+        if not find_spec("nerfstudio"):
+            yield Figure("time until within 1 dB of the final PSNR", None, "s")
+            return
+        soon, memory, final = [], [], []
+        seconds = 3.0 if self.quick else self.seconds
+        for seed in self.seeds[:1] if self.quick else self.seeds:
+            with tempfile.TemporaryDirectory() as folder:
+                records = _train(_demo_scene(Path(folder), seed, self.quick), Path(folder), seed, seconds)
+            last = records[-1]
+            final.append(last["psnr"])
+            soon.append(next(one["train_seconds"] for one in records if one["psnr"] >= last["psnr"] - 1))
+            memory.append(last["peak_memory_mib"] / 1024)
+            yield Figure(f"demo scene, seed {seed}, {seconds:g} s: PSNR", last["psnr"], "dB")
+            yield Figure(f"demo scene, seed {seed}, {seconds:g} s: position error", 100 * last["ate_m"], "cm")
+            yield Figure(f"demo scene, seed {seed}, {seconds:g} s: rotation error", last["rotation_deg"], "deg")
+            yield Figure(f"demo scene, seed {seed}: within 1 dB of that", soon[-1], "s")
+        yield Figure("time until within 1 dB of the final PSNR, median", median(soon), "s", at_most=60)
+        yield Figure("peak memory of training, largest", max(memory), "GiB", at_most=2)
+
+
+class _Step:
+    """One training step from events to updated field and poses, of the core rooms alone."""
+
+    def __init__(self, index: PairIndex, pairs: int = 512, samples: int = 24, levels: int = 8, keyframes: int = 41):
+        torch.manual_seed(0)
+        self.index, self.pairs = index, pairs
+        self.heldout = HeldoutBlocks(0, 2_000_000, 0.05)
+        self.renderer = _renderer(samples, levels)
+        rows, columns = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+        plane = torch.stack([(columns - WIDTH / 2) / FOCAL_PX, (rows - HEIGHT / 2) / FOCAL_PX], dim=-1).flatten(0, 1)
+        bearing = torch.cat([plane, torch.ones(len(plane), 1)], dim=-1)
+        self.bearing = torch.nn.functional.normalize(bearing, dim=-1).to(_device())
+        self.keyframe_t_us = torch.linspace(0, 2_000_000, keyframes).long().to(_device())
+        wiggle = torch.sin(torch.linspace(0, 6, keyframes))[:, None] * torch.tensor([0.2, 0.1, 0.05])
+        self.start = Poses(wiggle.to(_device()), quat_wxyz_exp(wiggle).to(_device()))
+        self.correction = torch.zeros(keyframes, 6, device=_device(), requires_grad=True)
+        parameters = [{"params": self.renderer.parameters(), "lr": 1e-2}, {"params": self.correction, "lr": 0.1}]
+        self.adam = torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
+        self.random = torch.Generator()
+        self.number = 0
+
+    def draw(self, batch: int) -> Any:
+        """Event pairs, as in training."""
+        return self.index.draw_accepted(self.pairs, 30, batch_random(0, batch), self.heldout.training)
+
+    def once(self) -> None:
+        """Event pairs, poses, rays, intensities, difference, loss, gradients, update."""
+        self.renderer.begin_step(self.number, self.random)
+        drawn = self.draw(self.number)
+        t_us = torch.from_numpy(np.r_[drawn.t0_us, drawn.t1_us]).to(_device())
+        poses = interpolate(self.keyframe_t_us, corrected(self.start, self.correction / FOCAL_PX), t_us)
+        bearing = self.bearing[torch.from_numpy(drawn.pixel).to(_device())].repeat(2, 1)
+        rendered = self.renderer(Rays(poses.position, rotate(poses.quat_wxyz, bearing)), self.random)
+        before, after = log_brightness(rendered.intensity, "log").chunk(2)
+        polarity_sum, event_count = (
+            torch.from_numpy(column).to(_device()) for column in (drawn.polarity_sum, drawn.event_count)
+        )
+        reported = reported_change(polarity_sum, event_count, 0.25, 0.25).to(before)
+        threshold_loss(after - before, reported, event_count, 0.25).backward()
+        self.adam.step()
+        self.adam.zero_grad()
+        self.number += 1
+
+
+def _renderer(samples: int, levels: int) -> Renderer:
+    shape = HashGridShape(levels=levels, features=4, coarsest=8, finest=192, table_size_log2=15)
+    field_ = RadianceField(shape, bounded=True, precision=fastest_precision(_device()))
+    return Renderer(field_, Sampling(samples)).to(_device())
+
+
+def _device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _seconds(once: Callable[[], None], repetitions: int) -> float:
+    """Median time after two calls to warm up."""
+    times = []
+    for _ in range(repetitions + 2):
+        started = perf_counter()
+        once()
+        if _device() == "cuda":
+            torch.cuda.synchronize()
+        times.append(perf_counter() - started)
+    return median(times[2:])
+
+
+def _copy_bandwidth() -> float:
+    """Bytes read and written a second by a copy within the GPU's memory."""
+    source = torch.empty(1 << 28, device="cuda")
+    target = torch.empty_like(source)
+    return 2 * source.numel() * 4 / _seconds(lambda: target.copy_(source), 9)
+
+
+def _some_events(begin: int, count: int, total: int) -> Recording:
+    """Events ``begin`` to ``begin + count`` of a recording of 2 s in which every pixel takes part."""
+    random = np.random.default_rng(begin)
+    t_us = (np.arange(begin, begin + count) * (2_000_000 / total)).astype(np.int64)
+    columns = (random.integers(0, WIDTH, count, np.uint16), random.integers(0, HEIGHT, count, np.uint16))
+    return Recording(*columns, t_us, random.choice(np.array([-1, 1], np.int8), count))
+
+
+def _chunks(total: int) -> Iterator[Recording]:
+    size = 1 << 22
+    return (_some_events(begin, min(size, total - begin), total) for begin in range(0, total, size))
+
+
+def _index(events: int) -> PairIndex:
+    return index_pairs(lambda: _chunks(events), WIDTH, HEIGHT)
+
+
+def _write_events(path: Path, events: int) -> None:
+    with h5py.File(path, "w") as file:
+        group = file.create_group("events")
+        for name, dtype in (("x", "u2"), ("y", "u2"), ("t", "i8"), ("p", "u1")):
+            group.create_dataset(name, (events,), dtype)
+        begin = 0
+        for chunk in _chunks(events):
+            rows = slice(begin, begin + len(chunk))
+            group["x"][rows], group["y"][rows], group["t"][rows] = chunk.x, chunk.y, chunk.t_us
+            group["p"][rows] = chunk.polarity > 0
+            begin += len(chunk)
+
+
+def _in_own_process(*words: str) -> dict[str, Any]:
+    """What this module prints when called with these words: memory is counted for a whole process."""
+    command = [sys.executable, "-m", "ebarf_ns.benchmarks.engine", *words]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+
+
+def _measure_index(path: Path, memory_gib: float) -> dict[str, float]:
+    import resource
+
+    from ebarf_ns.events.recording import RecordingFile
+
+    file = RecordingFile(path, WIDTH, HEIGHT)
+    # Compiled before the clock starts.
+    index_pairs(lambda: [file.window(0, 20_000)], WIDTH, HEIGHT)
+    started = perf_counter()
+    index = index_pairs(file.chunks, WIDTH, HEIGHT, int(memory_gib * 2**30))
+    seconds = perf_counter() - started
+    step = HeldoutBlocks(0, 2_000_000, 0.05)
+    batch = _seconds(lambda: index.draw_accepted(512, 30, batch_random(0, 0), step.training) and None, 30)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return {"seconds": seconds, "peak_gib": peak, "batch_ms": 1e3 * batch}
+
+
+def _demo_scene(folder: Path, seed: int, quick: bool) -> Path:
+    from ebarf_ns.simulation.simulate import Simulation, simulate
+
+    scene = folder / f"scene-{seed}"
+    small = {"width": 48, "height": 36, "focal_px": 41.0, "duration_s": 0.5, "frames": 3} if quick else {}
+    simulate(Simulation(seed=seed, **small), scene, lambda _: None)
+    return scene
+
+
+def _train(scene: Path, folder: Path, seed: int, seconds: float) -> list[dict[str, Any]]:
+    """The evaluations of one training, as a user would run it, in a process of its own."""
+    command = [
+        Path(sys.executable).parent / "ns-train", "ebarf", "--data", scene, "--output-dir", folder,
+        "--experiment-name", "x", "--timestamp", "run", "--machine.seed", seed, "--max-train-seconds", seconds,
+        "--max-num-iterations", 10**7, "--evaluations", 24, "--vis", "tensorboard",
+        "--logging.local-writer.enable", "False",
+    ]  # fmt: skip
+    subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    lines = (folder / "x" / "ebarf" / "run" / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line) for line in lines[1:]]
+
+
+def machine() -> str:
+    """Processor or GPU, for people."""
+    if torch.cuda.is_available():
+        return f"one {torch.cuda.get_device_name()}"
+    name = platform.processor() or platform.machine()
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), name)
+    return f"{os.cpu_count()} cores of {name}"
+
+
+def _shown(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def table(result: dict[str, Any]) -> str:
+    """The figures, as Markdown."""
+    lines = [f"{result['machine']}, {result['date']}", "", "| what | measured | target | |", "|---|---|---|---|"]
+    for one in result["figures"]:
+        figure = Figure(**{name: value for name, value in one.items() if name != "verdict"})
+        lines.append(f"| {figure.what} | {_shown(figure.value)} {figure.unit} | {figure.target} | {figure.verdict} |")
+    return "\n".join(lines)
+
+
+def write(result: dict[str, Any], path: Path) -> None:
+    """Keep the figures as JSON."""
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def main(words: list[str]) -> None:
+    """``python -m ebarf_ns.benchmarks.engine [PART ...]``: for machines without the rest of the project."""
+    if words[:1] == ["index"] and len(words) == 3:
+        print(json.dumps(_measure_index(Path(words[1]), float(words[2]))))
+        return
+    quick = "--quick" in words
+    parts: tuple[Part, ...] = tuple(part for part in PARTS if part in words) or PARTS
+    result = run_engine_benchmark(EngineBenchmark(parts, quick), lambda line: print(line, file=sys.stderr, flush=True))
+    print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

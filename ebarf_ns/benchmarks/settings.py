@@ -1,0 +1,20 @@
+"""What the benchmarks can be asked for; light, for the command line."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Part = Literal["hash_grid", "step", "scaling", "frame", "index", "nerfacto", "training"]
+PARTS: tuple[Part, ...] = get_args(Part)
+
+
+@dataclass(frozen=True)
+class EngineBenchmark:
+    """What to measure and how thoroughly."""
+
+    parts: tuple[Part, ...] = PARTS
+    quick: bool = False
+    """Small sizes and few repetitions: whether it runs, not how fast."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the trainings on the demo scene."""
+    seconds: float = 120.0
+    """Training time of each."""

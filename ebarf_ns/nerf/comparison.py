@@ -1,0 +1,107 @@
+"""Nerfstudio's own encoding and method, timed beside ours."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.field_components.encodings import HashEncoding
+from nerfstudio.models.nerfacto import NerfactoModelConfig
+from torch import nn
+
+if TYPE_CHECKING:
+    from ebarf_ns.radiance.hash_grid import HashGridShape
+
+
+def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.Parameter]]:
+    """Nerfstudio's encoding in torch, and its parameters."""
+    encoding = HashEncoding(
+        num_levels=shape.levels,
+        min_res=shape.coarsest,
+        max_res=shape.finest,
+        log2_hashmap_size=shape.table_size_log2,
+        features_per_level=shape.features,
+        implementation="torch",
+    ).to(device)
+    return encoding, list(encoding.parameters())
+
+
+def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> float:
+    """Of the registered method, through the trainer, on a scene; the first half of the steps warms up."""
+    from ebarf_ns.nerf.method import ebarf
+    from ebarf_ns.nerf.trainer import EbarfTrainerConfig
+
+    config = copy.deepcopy(ebarf.config)
+    assert isinstance(config, EbarfTrainerConfig)
+    config.pipeline.datamanager.data = scene
+    config.output_dir, config.experiment_name, config.timestamp = folder, "speed", "run"
+    config.vis, config.logging.local_writer.enable, config.evaluations = "tensorboard", False, 0
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.pipeline.train()
+    times = []
+    for step in range(steps):
+        started = perf_counter()
+        trainer.train_iteration(step)
+        times.append(perf_counter() - started)
+    # The mean: every eighth step also refreshes the remembered density.
+    seconds = sum(times[steps // 2 :]) / (steps - steps // 2)
+    return trainer.pipeline.datamanager.get_train_rays_per_batch() / seconds
+
+
+def nerfacto_rays_per_second(same_grid_and_samples: bool, repetitions: int) -> float:
+    """Of stock nerfacto in torch: rays to updated parameters, without its data manager, at its own batch of 4,096.
+
+    ``same_grid_and_samples`` gives its field the grid and the number of samples a ray that ebarf has in the demo scene.
+    """
+    shape: dict[str, Any] = {
+        "num_levels": 8, "features_per_level": 4, "base_res": 8, "max_res": 192, "log2_hashmap_size": 15,
+        "num_nerf_samples_per_ray": 24,
+    } if same_grid_and_samples else {}  # fmt: skip
+    rays = 1024 if same_grid_and_samples else 4096
+    model = _without_lpips(NerfactoModelConfig(implementation="torch", **shape))
+    optimizers = [torch.optim.Adam(group, lr=1e-2, eps=1e-15) for group in model.get_param_groups().values() if group]
+    times = []
+    for _ in range(repetitions + 1):
+        bundle, batch = _some_rays(rays), {"image": torch.rand(rays, 3)}
+        started = perf_counter()
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        outputs = model(bundle)
+        losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+        sum(losses.values(), torch.zeros(())).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        times.append(perf_counter() - started)
+    return rays / median(times[1:])
+
+
+def _without_lpips(config: NerfactoModelConfig) -> Any:
+    """The model, but for a metric whose weights it would fetch from the network."""
+    from torchmetrics.image import lpip
+
+    kept = lpip.LearnedPerceptualImagePatchSimilarity
+    lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: nn.Identity()  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        box = SceneBox(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+        return config.setup(scene_box=box, num_train_data=41, metadata={}).train()
+    finally:
+        lpip.LearnedPerceptualImagePatchSimilarity = kept
+
+
+def _some_rays(count: int) -> RayBundle:
+    direction = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    return RayBundle(
+        origins=0.2 * torch.rand(count, 3),
+        directions=direction,
+        pixel_area=torch.full((count, 1), 1e-4),
+        camera_indices=torch.randint(0, 41, (count, 1)),
+        metadata={"directions_norm": torch.ones(count, 1)},
+    )

@@ -1,0 +1,179 @@
+"""What a scene needs, decided by looking at it: every line with its reason, and overridable by the flag it names.
+
+A field of the configuration that is None is for the plan to decide; what it decided is written into the run's
+``config.yml`` and into the header of its metrics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from math import ceil, log
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ebarf_ns.geometry.smoothing import smoothed
+from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_log, quat_wxyz_multiply, rotate
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
+from ebarf_ns.radiance.field import fastest_precision
+from ebarf_ns.radiance.ray_sampling import Rays, leave_box
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from ebarf_ns.scene import Scene
+
+_COARSEST = 8
+_GROWTH = 1.6
+_STRAIGHT_PX = 0.25
+
+
+@dataclass(frozen=True)
+class Line:
+    """One decision."""
+
+    field: str
+    """Where in the run's configuration, in dots."""
+    value: Any
+    reason: str
+
+    @property
+    def flag(self) -> str:
+        """What overrides it on the command line."""
+        return "--" + self.field.replace("_", "-")
+
+
+def plan_for(scene: Scene, trajectory: Trajectory, events: int, device: str) -> list[Line]:
+    """Decide for a scene with its initial trajectory and number of events, on "cpu" or "cuda"."""
+    finest, why = _finest(scene, trajectory)
+    levels = 1 + ceil(log(finest / _COARSEST) / log(_GROWTH))
+    surface, enough = 2 * log(finest, 2), log(max(events, 1), 2)
+    rows_log2 = int(np.clip(round(min(surface, enough)), 10, 19))
+    few = "no more than there are events" if enough < surface else f"as many as a wall has cells of 1/{finest}"
+    stride, straight = _stride(scene, trajectory)
+    precision = fastest_precision(device)
+    threshold, bounded = scene.contrast_threshold, scene.bounds is not None
+    rays = 16384 if device == "cuda" else 1024
+    return [
+        Line(
+            "pipeline.model.loss",
+            "threshold" if threshold else "normalized",
+            f"contrast thresholds are known, on {threshold.on} and off {threshold.off}: Eq. 5"
+            if threshold
+            else "contrast thresholds are unknown: Eq. 6",
+        ),
+        Line(
+            "pipeline.model.contract",
+            not bounded,
+            "the scene has bounds: no contraction"
+            if bounded
+            else "the scene has no bounds: all of space is contracted",
+        ),
+        Line("pipeline.model.grid_finest", finest, why),
+        Line("pipeline.model.grid_levels", levels, f"from {_COARSEST} to {finest} in steps of at most {_GROWTH}"),
+        Line("pipeline.model.grid_table_size_log2", rows_log2, f"{1 << rows_log2:,} rows a level: {few}"),
+        Line("pipeline.model.density_cells", int(np.clip(finest // 2, 32, 128)), "half the finest resolution"),
+        Line(
+            "pipeline.model.samples",
+            24,
+            "importance sampling finds the surface: 48 were no better on the demo scene",
+        ),
+        Line(
+            "pipeline.model.precision",
+            precision,
+            "this processor multiplies bfloat16 natively" if precision == "bfloat16" else "no native bfloat16 here",
+        ),
+        Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
+        Line(
+            "pipeline.datamanager.train_num_rays_per_batch", rays, f"keeps {'a GPU' if rays > 1024 else 'caches'} full"
+        ),
+    ]
+
+
+def apply_plan(lines: list[Line], configuration: Any) -> list[Line]:
+    """Fill in what is None in ``configuration``; returns the lines as they are in force."""
+    in_force = []
+    for line in lines:
+        *path, name = line.field.split(".")
+        part = reduce(getattr, path, configuration)
+        value = getattr(part, name)
+        if value is None:
+            setattr(part, name, line.value)
+            in_force.append(line)
+        else:
+            in_force.append(Line(line.field, value, f"set by flag or method (planned: {line.value}, {line.reason})"))
+    return in_force
+
+
+def _finest(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
+    """Cells per side of the finest level: one for each pixel's footprint where the scene is."""
+    focal_px = scene.camera.fx
+    if scene.bounds is None:
+        # Contracted space is four units wide, and a pixel's footprint in it about 2 / focal_px from one unit on.
+        finest = int(np.clip(2 * focal_px, 64, 2048))
+        return (
+            finest,
+            f"no bounds: twice the focal length of {focal_px:.0f} px, a pixel's footprint beyond the near field",
+        )
+    distance, size = _distance(scene, trajectory)
+    finest = int(np.clip(round(size * focal_px / distance), 64, 2048))
+    footprint = distance / focal_px
+    return (
+        finest,
+        f"a pixel covers {footprint:.3g} at the far side of the bounds, {distance:.3g} away; they are {size:.3g} wide",
+    )
+
+
+def _distance(scene: Scene, trajectory: Trajectory) -> tuple[float, float]:
+    """Median distance to the far side of the bounds over keyframes and directions, and the bounds' widest side."""
+    lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
+    size = float((upper - lower).max())
+    few = slice(None, None, max(1, len(trajectory.t_us) // 50))
+    position, quat_wxyz = (column[few].double() for column in trajectory.poses)
+    bearing = _some_bearings(scene).double()
+    direction = rotate(quat_wxyz[:, None], bearing[None]).flatten(0, 1)
+    origin = ((position - (lower + upper) / 2) * 2 / size).repeat_interleave(len(bearing), dim=0)
+    inside = (origin.abs() <= 1).all(dim=-1)
+    exits = leave_box(Rays(origin[inside], direction[inside]))
+    return float(exits.median()) * size / 2, size
+
+
+def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:
+    camera = scene.camera
+    columns, rows = np.linspace(0, camera.width - 1, 5), np.linspace(0, camera.height - 1, 5)
+    return camera.bearings(torch.cartesian_prod(torch.from_numpy(columns), torch.from_numpy(rows)))
+
+
+def _stride(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
+    """How far apart corrections are learned: as far as the motion between is straight to a quarter of a pixel."""
+    smooth = smoothed(trajectory)
+    distance = _distance(scene, trajectory)[0] if scene.bounds is not None else None
+    keyframes = len(trajectory.t_us)
+    stride, off_px = 1, 0.0
+    while 2 * stride * 4 <= keyframes:
+        wider = _off_straight_px(smooth, 2 * stride, scene.camera.fx, distance)
+        if wider > _STRAIGHT_PX:
+            break
+        stride, off_px = 2 * stride, wider
+    rate = (keyframes - 1) / (float(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6)
+    if stride == 1:
+        return 1, f"{rate:.0f} keyframes a second: between any further apart, the motion is not straight"
+    return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
+
+
+def _off_straight_px(smooth: Trajectory, stride: int, focal_px: float, distance: float | None) -> float:
+    """How far keyframes are from the straight line between each ``stride``-th, root mean square, in pixels.
+
+    Without a known distance, four times the trajectory's radius stands for it.
+    """
+    knots = torch.arange(0, len(smooth.t_us) - 1, stride)
+    knots = torch.cat([knots, torch.tensor([len(smooth.t_us) - 1])])
+    line = interpolate(smooth.t_us[knots], Poses(*(column[knots] for column in smooth.poses)), smooth.t_us)
+    position = smooth.poses.position
+    if distance is None:
+        distance = 4 * float((position - position.mean(dim=0)).norm(dim=-1).max())
+    moved = (line.position - position).norm(dim=-1) / max(distance, 1e-9)
+    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(line.quat_wxyz), smooth.poses.quat_wxyz))
+    return float((moved + turn.norm(dim=-1)).square().mean().sqrt()) * focal_px

@@ -1,0 +1,98 @@
+"""Importance sampling on a CPU in one pass: each ray walks the remembered density and places its samples."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from ebarf_ns.radiance.ray_sampling import DensityGrid, Rays
+
+
+def importance_edges(
+    grid: DensityGrid,
+    rays: Rays,
+    near: float,
+    far: Float[Tensor, "rays"],
+    coarse: int,
+    uniform_share: float,
+    samples: int,
+    jitter: Float[Tensor, "rays 1"],
+    pairs: bool,
+) -> Float[Tensor, "rays samples+1"]:
+    """What :func:`ebarf_ns.radiance.ray_sampling.importance_edges` computes, for float32 on a CPU."""
+    edges = torch.empty(len(far), samples + 1)
+    sharing = 2 if pairs else 1
+    columns = (rays.origin.contiguous(), rays.direction.contiguous(), far, jitter[:, 0], grid.density)
+    arrays = [column.detach().numpy() for column in columns]
+    scratch = np.empty((len(far) // sharing, coarse + 1), np.float32)
+    _place(*arrays, np.float32(near), grid.half_side, grid.cells, np.float32(uniform_share), scratch, edges.numpy())
+    return edges
+
+
+@njit(cache=True, inline="always")
+def _cell(x, y, z, half_side, cells):
+    """Number of the cell that holds a point; all of space is contracted where the grid reaches beyond 1."""
+    if half_side > 1:
+        size = max(abs(x), abs(y), abs(z))
+        if size > 1:
+            squeeze = (2 - 1 / size) / size
+            x, y, z = x * squeeze, y * squeeze, z * squeeze
+    scale, last = np.float32(cells / (2 * half_side)), np.float32(cells - 1)
+    ix = np.int32(min(max((x + np.float32(half_side)) * scale, np.float32(0)), last))
+    iy = np.int32(min(max((y + np.float32(half_side)) * scale, np.float32(0)), last))
+    iz = np.int32(min(max((z + np.float32(half_side)) * scale, np.float32(0)), last))
+    return ix + cells * (iy + cells * iz)
+
+
+@njit(cache=True, parallel=True, fastmath=True, nogil=True, error_model="numpy")
+def _place(origin, direction, far, jitter, density, near, half_side, cells, uniform_share, cumulative, edges):
+    groups, coarse = len(cumulative), cumulative.shape[1] - 1
+    sharing, samples = len(far) // max(groups, 1), edges.shape[1] - 1
+    for group in prange(groups):
+        end = max(far[group], 2 * near)
+        step = (end - near) / coarse
+        ratio = (end / near) ** (np.float32(1) / coarse)
+        weights = cumulative[group]
+        weights[:] = 0
+        for k in range(sharing):
+            ray = group + k * groups
+            lower, transmitted = near, np.float32(1)
+            for i in range(coarse):
+                upper = near + (i + 1) * step if half_side == 1 else lower * ratio
+                middle = (lower + upper) / 2
+                x = origin[ray, 0] + middle * direction[ray, 0]
+                y = origin[ray, 1] + middle * direction[ray, 1]
+                z = origin[ray, 2] + middle * direction[ray, 2]
+                passed = np.exp(-density[_cell(x, y, z, half_side, cells)] * (upper - lower))
+                weights[i + 1] += transmitted * (1 - passed) / sharing
+                transmitted *= passed
+                lower = upper
+        seen = np.float32(0)
+        for i in range(coarse):
+            seen += weights[i + 1]
+        # What passes through the scene is spread evenly too.
+        spread = (uniform_share + max(1 - seen, np.float32(0))) / coarse
+        total = seen + spread * coarse
+        for i in range(coarse):
+            weights[i + 1] = weights[i] + (weights[i + 1] + spread) / total
+        i, lower = 0, near
+        upper = near + step if half_side == 1 else near * ratio
+        first = edges[group]
+        first[0], first[samples] = near, end
+        for j in range(1, samples):
+            wanted = (j + jitter[group]) / samples
+            while i < coarse - 1 and weights[i + 1] <= wanted:
+                i += 1
+                lower = upper
+                upper = near + (i + 1) * step if half_side == 1 else lower * ratio
+            share = (wanted - weights[i]) / max(weights[i + 1] - weights[i], np.float32(1e-12))
+            first[j] = lower + min(max(share, np.float32(0)), np.float32(1)) * (upper - lower)
+        for k in range(1, sharing):
+            edges[group + k * groups] = first
