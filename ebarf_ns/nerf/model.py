@@ -21,6 +21,7 @@ from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
 from ebarf_ns.scene import Scene
 
+_FIRST_LEVELS = 2
 T = TypeVar("T")
 
 
@@ -55,6 +56,8 @@ class EbarfModelConfig(ModelConfig):
     """Cells per side of the finest level; None: as planned."""
     grid_table_size_log2: int | None = None
     """Rows of the table a level; None: as planned."""
+    all_levels_from: float = 0.0
+    """Fraction of the budget over which the grid's levels come in, coarse to fine (BARF); 0: all from the start."""
     sampling: Literal["importance", "uniform"] = "importance"
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
     samples: int | None = None
@@ -131,9 +134,18 @@ class EbarfModel(Model):
         return groups
 
     def begin_step(self, step: int, seed: int) -> None:
-        """Random numbers are a function of seed and step, so that a resumed run continues as if never stopped."""
+        """Random numbers are a function of seed and step, so that a resumed run continues as if never stopped.
+
+        Each process of several has a seed of its own; what the first one remembers of densities goes for all.
+        """
         self.random.manual_seed(seed * 1_000_003 + step)
         self.renderer.begin_step(step, self.random)
+
+    def follow_budget(self, progress: float) -> None:
+        """Let in the grid's levels that are due at this fraction of the budget."""
+        levels, until = _planned(self.config.grid_levels), self.config.all_levels_from
+        share = min(progress / until, 1.0) if until else 1.0
+        self.renderer.field.grid.open_levels(_FIRST_LEVELS + share * (levels - _FIRST_LEVELS))
 
     def restart_field(self) -> None:
         """Forget the field and keep the poses."""

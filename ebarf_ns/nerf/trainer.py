@@ -159,14 +159,17 @@ class EbarfTrainer(Trainer):
     def train(self) -> None:
         """Train to the end of the budget."""
         with one_line_errors():
-            write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
             self._begin_metrics()
             super().train()
 
     def _after_train(self) -> None:
         self.save_checkpoint(self.step)
-        write_report(self.base_dir, self.pipeline.scene.groundtruth)
+        self._write_report()
         super()._after_train()
+
+    @check_main_thread
+    def _write_report(self) -> None:
+        write_report(self.base_dir, self.pipeline.scene.groundtruth)
 
     def train_iteration(self, step: int) -> Any:
         """One step, its share of the budget, and the evaluation that may be due after it."""
@@ -175,13 +178,14 @@ class EbarfTrainer(Trainer):
         for scheduler in self.optimizers.schedulers.values():
             if isinstance(scheduler, BudgetDecay):
                 scheduler.progress = before
+        self.pipeline.model.follow_budget(before)
         restart_at = self.config.restart_field_at
         if restart_at is not None and before >= restart_at and not self.field_restarted:
             self._restart_field()
         result = super().train_iteration(step)
         self.steps_done = step + 1
-        self.train_seconds += monotonic() - started
-        self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2
+        self.train_seconds = self._agreed(self.train_seconds + monotonic() - started)
+        self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2 * self.world_size
         self.pipeline.record_cost(self.train_seconds, self.event_pairs)
         after = self.progress()
         if int(after * self.config.evaluations) > int(before * self.config.evaluations) or after >= 1:
@@ -190,10 +194,21 @@ class EbarfTrainer(Trainer):
             self.stop_training = True
         return result
 
+    def _agreed(self, seconds: float) -> float:
+        """The first process's clock: all processes must take schedules, restart and end at the same step."""
+        if self.world_size == 1:
+            return seconds
+        clock = torch.tensor([seconds], dtype=torch.float64, device=self.device)
+        torch.distributed.broadcast(clock, 0)
+        return float(clock)
+
     def _restart_field(self) -> None:
         """A field trained under wrong poses holds them in place: learn it anew under the refined ones."""
         self.field_restarted = True
-        self.pipeline.model.restart_field()
+        # The same new field in every process, and in a run that was resumed.
+        with torch.random.fork_rng():
+            torch.manual_seed(self.config.machine.seed)
+            self.pipeline.model.restart_field()
         self.optimizers.optimizers["fields"].state.clear()
 
     @check_main_thread
@@ -218,7 +233,8 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def _begin_metrics(self) -> None:
-        """Header first; a run that goes on in its own folder keeps what is there."""
+        """Initial trajectory and header first; a run that goes on in its own folder keeps what is there."""
+        write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
         path = self.base_dir / "metrics.jsonl"
         if self._start_step == 0 or not path.is_file():
             with whole_file(path) as temporary:
