@@ -17,6 +17,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from torch import nn
 
 if TYPE_CHECKING:
+    from ebarf_ns.nerf.model import EbarfModelConfig
     from ebarf_ns.radiance.hash_grid import HashGridShape
 
 
@@ -33,8 +34,11 @@ def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.
     return encoding, list(encoding.parameters())
 
 
-def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> float:
-    """Of the registered method, through the trainer, on a scene; the first half of the steps warms up."""
+def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float, EbarfModelConfig]:
+    """Of the registered method, through the trainer, on a scene, and the model as planned for it.
+
+    The first half of the steps warms up; of the others the mean counts, because every eighth does more.
+    """
     from ebarf_ns.nerf.method import ebarf
     from ebarf_ns.nerf.trainer import EbarfTrainerConfig
 
@@ -51,21 +55,25 @@ def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> float:
         started = perf_counter()
         trainer.train_iteration(step)
         times.append(perf_counter() - started)
-    # The mean: every eighth step also refreshes the remembered density.
     seconds = sum(times[steps // 2 :]) / (steps - steps // 2)
-    return trainer.pipeline.datamanager.get_train_rays_per_batch() / seconds
+    return trainer.pipeline.datamanager.get_train_rays_per_batch() / seconds, trainer.pipeline.model.config
 
 
-def nerfacto_rays_per_second(same_grid_and_samples: bool, repetitions: int) -> float:
-    """Of stock nerfacto in torch: rays to updated parameters, without its data manager, at its own batch of 4,096.
+def nerfacto_rays_per_second(like: EbarfModelConfig | None, rays: int, repetitions: int) -> float:
+    """Of stock nerfacto in torch: rays to updated parameters, without its data manager.
 
-    ``same_grid_and_samples`` gives its field the grid and the number of samples a ray that ebarf has in the demo scene.
+    With ``like``, its field gets the grid and the number of samples a ray of that configuration.
     """
-    shape: dict[str, Any] = {
-        "num_levels": 8, "features_per_level": 4, "base_res": 8, "max_res": 192, "log2_hashmap_size": 15,
-        "num_nerf_samples_per_ray": 24,
-    } if same_grid_and_samples else {}  # fmt: skip
-    rays = 1024 if same_grid_and_samples else 4096
+    shape: dict[str, Any] = {}
+    if like:
+        shape = {
+            "num_levels": like.grid_levels,
+            "features_per_level": like.grid_features,
+            "base_res": like.grid_coarsest,
+            "max_res": like.grid_finest,
+            "log2_hashmap_size": like.grid_table_size_log2,
+            "num_nerf_samples_per_ray": like.samples,
+        }
     model = _without_lpips(NerfactoModelConfig(implementation="torch", **shape))
     optimizers = [torch.optim.Adam(group, lr=1e-2, eps=1e-15) for group in model.get_param_groups().values() if group]
     times = []

@@ -2,7 +2,6 @@
 
 import json
 import platform
-import resource
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from importlib.metadata import version
@@ -26,6 +25,7 @@ from ebarf_ns.evaluation.report import write_report
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
+from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.plan import apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
@@ -222,7 +222,7 @@ class EbarfTrainer(Trainer):
             "loss": loss,
             **results,
             "skipped_steps": self.optimizers.skipped,
-            "peak_memory_mib": round(_peak_memory_mib(self.device), 1),
+            "peak_memory_mib": round(peak_memory_mib(self.device), 1),
         }
         self._record_metrics(record)
         write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
@@ -311,12 +311,6 @@ class EbarfTrainer(Trainer):
             step = self.config.load_step
             return self.config.load_dir / f"step-{step:09d}.ckpt" if step is not None else steps[-1]
         return self.config.load_checkpoint
-
-
-def _peak_memory_mib(device: str) -> float:
-    if device.startswith("cuda"):
-        return torch.cuda.max_memory_allocated() / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _digest(content: bytes) -> str:

@@ -1,0 +1,20 @@
+"""How much memory a run has taken."""
+
+import resource
+import sys
+from pathlib import Path
+
+import torch
+
+
+def peak_memory_mib(device: str = "cpu") -> float:
+    """Most memory held at once since the process began: on a GPU by torch, else by the process."""
+    if device.startswith("cuda"):
+        return torch.cuda.max_memory_allocated() / 2**20
+    status = Path("/proc/self/status")
+    if status.is_file():
+        # What getrusage says includes the parent of a process, from before it became a program of its own.
+        lines = status.read_text(encoding="utf-8").splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20

@@ -1,0 +1,66 @@
+"""The engine benchmark runs; how fast things are is its business, not that of these tests."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ebarf_ns.benchmarks.engine import Figure, table
+from ebarf_ns.benchmarks.settings import PARTS
+from tests.conftest import run_command
+
+BARE = """
+import importlib.util, sys
+for name in "nerfstudio jaxtyping scipy tyro rich hdf5plugin evo matplotlib torchmetrics viser cv2 yaml".split():
+    sys.modules[name] = None
+found = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *rest: None if name == "nerfstudio" else found(name, *rest)
+from ebarf_ns.benchmarks import engine
+engine.main(sys.argv[1:])
+"""
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    path = tmp_path_factory.mktemp("bench") / "engine.json"
+    finished = run_command("ebarf", "bench", "engine", "--quick", "--json", "--output", path)
+    assert finished.code == 0, finished.errors[-3000:]
+    assert json.loads(finished.output) == json.loads(path.read_text())
+    return json.loads(finished.output)
+
+
+def test_every_part_yields_finite_figures(result: dict):
+    assert result["quick"] and result["machine"] and result["carrier"] == "numba"
+    assert all(math.isfinite(figure["value"]) for figure in result["figures"])
+    names = " ".join(figure["what"] for figure in result["figures"])
+    for words in ("hash grid against", "pairs per second", "sampler's speed", "growth with keyframes", "frame",
+                  "in a file", "against nerfacto", "within 1 dB", "peak memory of training"):  # fmt: skip
+        assert words in names
+
+
+def test_the_table_shows_targets_and_verdicts(result: dict):
+    text = table(result)
+    assert "| hash grid against nerfstudio's |" in text and "| >= 12 |" in text
+    assert text.count("reached") + text.count("missed") >= 12
+
+
+def test_verdicts():
+    assert Figure("x", 13, "times", at_least=12).verdict == "reached"
+    assert Figure("x", 11, "times", at_least=12).verdict == "missed"
+    assert Figure("x", 61, "s", at_most=60).verdict == "missed"
+    assert Figure("x", None, "s", at_most=60).verdict == "not measured" and Figure("x", 1, "s").verdict == ""
+
+
+def test_our_own_code_is_measured_with_torch_numpy_numba_and_h5py_alone(tmp_path: Path):
+    parts = [part for part in PARTS if part not in ("index", "scaling")]
+    finished = subprocess.run(
+        [sys.executable, "-c", BARE, "--quick", *parts],
+        capture_output=True, text=True, timeout=300, check=False, cwd=tmp_path, env={**os.environ},
+    )  # fmt: skip
+    assert finished.returncode == 0, finished.stderr[-3000:]
+    figures = {figure["what"]: figure["value"] for figure in json.loads(finished.stdout)["figures"]}
+    assert figures["step of 512 pairs"] > 0 and figures["training rays per second against nerfacto"] is None

@@ -1,0 +1,93 @@
+"""What is decided for a scene, why, and who may overrule it."""
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.plan import Line, apply_plan, plan_for
+from ebarf_ns.scene import Scene, read_scene
+
+
+@pytest.fixture
+def scene(tiny_scene: Path) -> Scene:
+    return read_scene(tiny_scene)
+
+
+def planned(scene: Scene, events: int = 500_000, trajectory: Trajectory | None = None, device: str = "cpu") -> dict:
+    lines = plan_for(scene, trajectory or read_tum(scene.trajectory), events, device)
+    assert all(line.reason for line in lines)
+    return {line.field.rsplit(".", 1)[-1]: line.value for line in lines}
+
+
+def test_parts_exist_only_where_the_scene_needs_them(scene: Scene):
+    assert planned(scene)["contract"] is False and planned(scene)["loss"] == "threshold"
+    bare = dataclasses.replace(scene, bounds=None, contrast_threshold=None)
+    assert planned(bare)["contract"] is True and planned(bare)["loss"] == "normalized"
+
+
+def test_resolution_follows_the_pixel_footprint(scene: Scene):
+    sharper = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=3 * scene.camera.fx))
+    finest = planned(dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=100.0)))["grid_finest"]
+    assert planned(sharper)["grid_finest"] == pytest.approx(1.23 * finest, rel=0.05)
+    assert planned(sharper)["grid_levels"] >= planned(scene)["grid_levels"]
+
+
+def test_scale_of_the_world_changes_nothing(scene: Scene):
+    assert scene.bounds
+    trajectory = read_tum(scene.trajectory)
+    large = Trajectory(trajectory.t_us, Poses(1e4 * trajectory.poses.position, trajectory.poses.quat_wxyz))
+    bounds = tuple(tuple(1e4 * side for side in corner) for corner in scene.bounds)
+    assert planned(dataclasses.replace(scene, bounds=bounds), trajectory=large) == planned(scene)  # pyright: ignore[reportArgumentType]
+
+
+def test_tables_hold_no_more_than_events_can_tell(scene: Scene):
+    assert planned(scene, events=2_000)["grid_table_size_log2"] == 11
+    assert planned(scene, events=1)["grid_table_size_log2"] == 10
+    assert planned(scene, events=10**9)["grid_table_size_log2"] <= 19
+
+
+def test_a_gpu_gets_larger_batches(scene: Scene):
+    rays = "train_num_rays_per_batch"
+    assert planned(scene, device="cuda")[rays] > planned(scene)[rays]
+
+
+def smooth_motion(rate_hz: int) -> Trajectory:
+    t_s = torch.arange(2 * rate_hz + 1, dtype=torch.float64) / rate_hz
+    position = torch.stack([0.3 * torch.sin(3 * t_s), 0.2 * torch.cos(2 * t_s), 0 * t_s], dim=-1)
+    quat_wxyz = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(len(t_s), 4)
+    return Trajectory((t_s * 1e6).round().long(), Poses(position, quat_wxyz))
+
+
+def test_dense_keyframes_share_corrections_and_sparse_ones_do_not(scene: Scene):
+    sparse, dense, denser = (
+        planned(scene, trajectory=smooth_motion(rate))["keyframe_stride"] for rate in (4, 100, 1000)
+    )
+    assert sparse == 1 < dense < denser
+
+
+def test_what_was_set_stays_and_is_named():
+    configuration = SimpleNamespace(model=SimpleNamespace(samples=None, grid_levels=5))
+    lines = [Line("model.samples", 24, "enough"), Line("model.grid_levels", 8, "needed")]
+    first, second = apply_plan(lines, configuration)
+    assert configuration.model.samples == 24 and configuration.model.grid_levels == 5
+    assert first == lines[0] and second.value == 5 and "planned: 8, needed" in second.reason
+    assert lines[1].flag == "--model.grid-levels"
+
+
+def test_inspect_prints_the_plan_a_run_keeps_and_flags_overrule(trained_run: Path, tiny_scene: Path):
+    from tests.conftest import run_ok
+
+    shown = {line["field"]: line for line in json.loads(run_ok("ebarf", "inspect", tiny_scene, "--json"))["plan"]}
+    kept = json.loads((trained_run / "metrics.jsonl").read_text().splitlines()[0])["plan"]
+    assert shown.keys() == kept.keys()
+    assert kept["pipeline.model.loss"] == {k: shown["pipeline.model.loss"][k] for k in ("value", "reason")}
+    assert kept["pipeline.model.samples"]["value"] == 24 and "set by flag" in kept["pipeline.model.samples"]["reason"]
+    text = run_ok("ebarf", "inspect", tiny_scene)
+    assert "--pipeline.model.grid-finest" in text and "Eq. 5" in text
+    assert "samples: 24" in (trained_run / "config.yml").read_text()
