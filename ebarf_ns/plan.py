@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from math import ceil, log
+from math import ceil, log, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,10 +48,10 @@ class Line:
 def plan_for(scene: Scene, trajectory: Trajectory, events: int, device: str) -> list[Line]:
     """Decide for a scene with its initial trajectory and number of events, on "cpu" or "cuda"."""
     finest, why = _finest(scene, trajectory)
+    if finest > (told := max(round(sqrt(events)), 32)):
+        finest, why = told, f"so that a wall has a cell for each event; pixels would resolve {finest}"
     levels = 1 + ceil(log(finest / _COARSEST) / log(_GROWTH))
-    surface, enough = 2 * log(finest, 2), log(max(events, 1), 2)
-    rows_log2 = int(np.clip(round(min(surface, enough)), 10, 19))
-    few = "no more than there are events" if enough < surface else f"as many as a wall has cells of 1/{finest}"
+    rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
     stride, straight = _stride(scene, trajectory)
     precision = fastest_precision(device)
     threshold, bounded = scene.contrast_threshold, scene.bounds is not None
@@ -73,12 +73,12 @@ def plan_for(scene: Scene, trajectory: Trajectory, events: int, device: str) -> 
         ),
         Line("pipeline.model.grid_finest", finest, why),
         Line("pipeline.model.grid_levels", levels, f"from {_COARSEST} to {finest} in steps of at most {_GROWTH}"),
-        Line("pipeline.model.grid_table_size_log2", rows_log2, f"{1 << rows_log2:,} rows a level: {few}"),
+        Line("pipeline.model.grid_table_size_log2", rows_log2, f"{1 << rows_log2:,} rows: a wall has {finest}² cells"),
         Line("pipeline.model.density_cells", int(np.clip(finest // 2, 32, 128)), "half the finest resolution"),
         Line(
             "pipeline.model.samples",
-            24,
-            "importance sampling finds the surface: 48 were no better on the demo scene",
+            16,
+            "the remembered density says where the surface is: more cost steps and brought nothing",
         ),
         Line(
             "pipeline.model.precision",
@@ -159,7 +159,7 @@ def _stride(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
         stride, off_px = 2 * stride, wider
     rate = (keyframes - 1) / (float(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6)
     if stride == 1:
-        return 1, f"{rate:.0f} keyframes a second: between any further apart, the motion is not straight"
+        return 1, f"{rate:.0f} keyframes a second: further apart, motion or the noise left by smoothing is not straight"
     return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
 
 

@@ -46,10 +46,11 @@ def test_scale_of_the_world_changes_nothing(scene: Scene):
     assert planned(dataclasses.replace(scene, bounds=bounds), trajectory=large) == planned(scene)  # pyright: ignore[reportArgumentType]
 
 
-def test_tables_hold_no_more_than_events_can_tell(scene: Scene):
-    assert planned(scene, events=2_000)["grid_table_size_log2"] == 11
-    assert planned(scene, events=1)["grid_table_size_log2"] == 10
-    assert planned(scene, events=10**9)["grid_table_size_log2"] <= 19
+def test_the_grid_is_no_finer_than_events_can_tell(scene: Scene):
+    few = planned(dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=500.0)), events=10_000)
+    assert few["grid_finest"] == 100 and few["grid_table_size_log2"] == 13
+    assert planned(scene, events=1)["grid_finest"] == 32 and planned(scene, events=1)["grid_table_size_log2"] == 10
+    assert planned(scene, events=10**12)["grid_table_size_log2"] <= 19
 
 
 def test_a_gpu_gets_larger_batches(scene: Scene):

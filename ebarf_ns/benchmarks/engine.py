@@ -171,7 +171,7 @@ class _Engine:
     def frame(self) -> Iterator[Figure]:
         """A DAVIS346's frame."""
         width, height = (34, 26) if self.quick else (346, 260)
-        renderer = _renderer(24, 8).eval()
+        renderer = _renderer(16, 8).eval()
         x, y = torch.meshgrid(torch.arange(width) / width - 0.5, torch.arange(height) / width - 0.4, indexing="xy")
         direction = torch.stack([x, y, torch.ones_like(x)], dim=-1).flatten(0, 1).to(_device())
         rays = Rays(torch.zeros_like(direction), torch.nn.functional.normalize(direction, dim=-1))
@@ -242,7 +242,7 @@ class _Engine:
 class _Step:
     """One training step from events to updated field and poses, of the core rooms alone."""
 
-    def __init__(self, index: PairIndex, pairs: int = 512, samples: int = 24, levels: int = 8, keyframes: int = 41):
+    def __init__(self, index: PairIndex, pairs: int = 512, samples: int = 16, levels: int = 8, keyframes: int = 41):
         torch.manual_seed(0)
         self.index, self.pairs = index, pairs
         self.heldout = HeldoutBlocks(0, 2_000_000, 0.05)

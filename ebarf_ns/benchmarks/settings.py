@@ -16,5 +16,5 @@ class EngineBenchmark:
     """Small sizes and few repetitions: whether it runs, not how fast."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of the trainings on the demo scene."""
-    seconds: float = 120.0
+    seconds: float = 100.0
     """Training time of each."""

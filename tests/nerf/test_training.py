@@ -227,3 +227,36 @@ def test_every_field_of_the_configuration_changes_the_run(tiny_scene: Path, tmp_
         ready.pipeline.train()
         losses.append([float(ready.train_iteration(step)[0].detach()) for step in range(3)])
     assert losses[0] != losses[1], f"{key} changed nothing"
+
+
+def test_the_fast_paths_train_as_the_torch_reference_does(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Kernels for encoding and sampling against plain torch, in float32: chaos apart, one and the same training."""
+    from ebarf_ns.radiance import ray_sampling, ray_sampling_numba
+
+    ends = []
+    for name in ("kernels", "reference"):
+        ready = trainer(config(tiny_scene, tmp_path / name, steps=60))
+        if name == "reference":
+            ready.pipeline.model.renderer.field.grid.carrier = "torch"
+            monkeypatch.setattr(ray_sampling_numba, "importance_edges", ray_sampling.importance_edges)
+        ready.train()
+        ends.append(ready.pipeline.evaluate())
+    fast, reference = ends
+    assert fast["psnr"] != reference["psnr"]
+    assert fast["psnr"] == pytest.approx(reference["psnr"], abs=0.3)
+    assert fast["heldout_event_loss"] == pytest.approx(reference["heldout_event_loss"], rel=0.03)
+    assert fast["ate_m"] == pytest.approx(reference["ate_m"], rel=0.02)
+
+
+def test_levels_come_in_over_the_fraction_asked_for(tiny_scene: Path, tmp_path: Path):
+    made = config(tiny_scene, tmp_path)
+    made.pipeline.model.all_levels_from = 0.5  # pyright: ignore[reportAttributeAccessIssue]
+    model = trainer(made).pipeline.model
+    weights = []
+    for progress in (0.0, 0.375, 0.5, 1.0):
+        model.follow_budget(progress)
+        weights.append(model.renderer.field.grid.lattice.level_weight.tolist())
+    assert weights[0] == [1, 1, 0, 0] and weights[2] == weights[3] == [1, 1, 1, 1]
+    assert weights[1][2] == 1 and 0.4 < weights[1][3] < 0.6

@@ -56,3 +56,31 @@ def test_huge_raw_density_stays_finite():
     field = RadianceField(SHAPE, bounded=True, density_bias=500.0)
     density, _ = field(torch.rand(10, 3), None)
     assert torch.isfinite(density).all()
+
+
+def test_half_precision_products_change_answers_and_gradients_by_little():
+    torch.manual_seed(0)
+    field = RadianceField(SHAPE, bounded=True)
+    torch.nn.init.normal_(field.grid.table)
+    point = (torch.rand(20_000, 3) * 2 - 1).requires_grad_()
+    found = {}
+    for precision in ("float32", "bfloat16"):
+        field.precision = precision
+        density, intensity = field(point, None)
+        assert density.dtype == intensity.dtype == torch.float32
+        (gradient,) = torch.autograd.grad((density + intensity).sum(), point)
+        found[precision] = density.log(), intensity.log(), gradient
+    # Eight bits of mantissa, through four products and for gradients back through four more.
+    for exact, rounded, tolerance in zip(*found.values(), (0.02, 0.02, 0.05), strict=True):
+        assert not torch.equal(exact, rounded)
+        assert (exact - rounded).norm() < tolerance * exact.norm()
+
+
+def test_pieces_that_stay_in_cache_add_up_to_the_whole(monkeypatch: pytest.MonkeyPatch):
+    torch.manual_seed(0)
+    field = RadianceField(SHAPE, bounded=True, view_dependent=True)
+    point, direction = torch.rand(1000, 3), torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
+    whole = field(point, direction)
+    monkeypatch.setattr("ebarf_ns.radiance.field._CHUNK", 300)
+    for one, other in zip(whole, field(point, direction), strict=True):
+        assert torch.allclose(one, other, atol=1e-6)
