@@ -15,6 +15,8 @@ def peak_memory_mib(device: str = "cpu") -> float:
     if status.is_file():
         # What getrusage says includes the parent of a process, from before it became a program of its own.
         lines = status.read_text(encoding="utf-8").splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+        for line in lines:
+            if line.startswith("VmHWM"):
+                return int(line.split()[1]) / 1024
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from ebarf_ns.scene import Scene
 
-_COARSEST = 8
 _GROWTH = 1.6
 _STRAIGHT_PX = 0.25
 
@@ -45,12 +44,18 @@ class Line:
         return "--" + self.field.replace("_", "-")
 
 
-def plan_for(scene: Scene, trajectory: Trajectory, events: int, device: str) -> list[Line]:
-    """Decide for a scene with its initial trajectory and number of events, on "cpu" or "cuda"."""
+def plan_for(
+    scene: Scene, trajectory: Trajectory, events: int, device: str, coarsest: int = 8, finest_given: int | None = None
+) -> list[Line]:
+    """Decide for a scene with its initial trajectory and number of events, on "cpu" or "cuda".
+
+    What is decided from the grid's coarsest and finest level follows those given, where they are.
+    """
     finest, why = _finest(scene, trajectory)
     if finest > (told := max(round(sqrt(events)), 32)):
         finest, why = told, f"so that a wall has a cell for each event; pixels would resolve {finest}"
-    levels = 1 + ceil(log(finest / _COARSEST) / log(_GROWTH))
+    planned_finest, finest = finest, finest_given or finest
+    levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
     stride, straight = _stride(scene, trajectory)
     precision = fastest_precision(device)
@@ -71,10 +76,18 @@ def plan_for(scene: Scene, trajectory: Trajectory, events: int, device: str) -> 
             if bounded
             else "the scene has no bounds: all of space is contracted",
         ),
-        Line("pipeline.model.grid_finest", finest, why),
-        Line("pipeline.model.grid_levels", levels, f"from {_COARSEST} to {finest} in steps of at most {_GROWTH}"),
-        Line("pipeline.model.grid_table_size_log2", rows_log2, f"{1 << rows_log2:,} rows: a wall has {finest}² cells"),
-        Line("pipeline.model.density_cells", int(np.clip(finest // 2, 32, 128)), "half the finest resolution"),
+        Line("pipeline.model.grid_finest", planned_finest, why),
+        Line("pipeline.model.grid_levels", levels, f"from {coarsest} to {finest} in steps of at most {_GROWTH}"),
+        Line(
+            "pipeline.model.grid_table_size_log2",
+            rows_log2,
+            f"{1 << rows_log2:,} rows, at most 524,288: a wall has {finest}² cells",
+        ),
+        Line(
+            "pipeline.model.density_cells",
+            int(np.clip(finest // 2, 32, 128)),
+            "half the finest resolution, within 32 and 128",
+        ),
         Line(
             "pipeline.model.samples",
             16,
@@ -115,7 +128,7 @@ def _finest(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
         finest = int(np.clip(2 * focal_px, 64, 2048))
         return (
             finest,
-            f"no bounds: twice the focal length of {focal_px:.0f} px, a pixel's footprint beyond the near field",
+            "twice the focal length in pixels, within 64 and 2048: a pixel's footprint beyond the near field",
         )
     distance, size = _distance(scene, trajectory)
     finest = int(np.clip(round(size * focal_px / distance), 64, 2048))
@@ -130,14 +143,17 @@ def _distance(scene: Scene, trajectory: Trajectory) -> tuple[float, float]:
     """Median distance to the far side of the bounds over keyframes and directions, and the bounds' widest side."""
     lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
     size = float((upper - lower).max())
-    few = slice(None, None, max(1, len(trajectory.t_us) // 50))
-    position, quat_wxyz = (column[few].double() for column in trajectory.poses)
+    centre = (lower + upper) / 2
+    place = (trajectory.poses.position.double() - centre) * 2 / size
+    inside = (place.abs() < 1).all(dim=-1).nonzero()[:, 0]
+    if not len(inside):
+        return size / 2, size
+    some = inside[:: max(1, len(inside) // 50)]
+    quat_wxyz = trajectory.poses.quat_wxyz[some].double()
     bearing = _some_bearings(scene).double()
     direction = rotate(quat_wxyz[:, None], bearing[None]).flatten(0, 1)
-    origin = ((position - (lower + upper) / 2) * 2 / size).repeat_interleave(len(bearing), dim=0)
-    inside = (origin.abs() <= 1).all(dim=-1)
-    exits = leave_box(Rays(origin[inside], direction[inside]))
-    return float(exits.median()) * size / 2, size
+    exits = leave_box(Rays(place[some].repeat_interleave(len(bearing), dim=0), direction))
+    return max(float(exits.median()), 0.01) * size / 2, size
 
 
 def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:
@@ -158,6 +174,8 @@ def _stride(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
             break
         stride, off_px = 2 * stride, wider
     rate = (keyframes - 1) / (float(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6)
+    if keyframes < 8:
+        return 1, f"there are but {keyframes} keyframes"
     if stride == 1:
         return 1, f"{rate:.0f} keyframes a second: further apart, motion or the noise left by smoothing is not straight"
     return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"

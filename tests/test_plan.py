@@ -53,6 +53,23 @@ def test_the_grid_is_no_finer_than_events_can_tell(scene: Scene):
     assert planned(scene, events=10**12)["grid_table_size_log2"] <= 19
 
 
+def test_what_follows_from_the_resolution_follows_the_one_given(scene: Scene):
+    trajectory = read_tum(scene.trajectory)
+    lines = {line.field: line for line in plan_for(scene, trajectory, 500_000, "cpu", finest_given=1000)}
+    assert lines["pipeline.model.grid_levels"].value > planned(scene)["grid_levels"]
+    assert "from 8 to 1000" in lines["pipeline.model.grid_levels"].reason
+    assert lines["pipeline.model.grid_finest"].value == planned(scene)["grid_finest"]
+
+
+def test_a_trajectory_that_hardly_enters_the_bounds_is_planned_for(scene: Scene):
+    trajectory = smooth_motion(500)
+    position = trajectory.poses.position + 1000
+    position[5] = 0
+    assert planned(scene, trajectory=Trajectory(trajectory.t_us, Poses(position, trajectory.poses.quat_wxyz)))
+    two = Trajectory(trajectory.t_us[:2], Poses(position[:2], trajectory.poses.quat_wxyz[:2]))
+    assert planned(scene, trajectory=two)["keyframe_stride"] == 1
+
+
 def test_a_gpu_gets_larger_batches(scene: Scene):
     rays = "train_num_rays_per_batch"
     assert planned(scene, device="cuda")[rays] > planned(scene)[rays]

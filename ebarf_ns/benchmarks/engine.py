@@ -19,6 +19,7 @@ from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from datetime import date
 from importlib.util import find_spec
+from itertools import count
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -29,7 +30,7 @@ import numpy as np
 import torch
 
 from ebarf_ns.benchmarks.settings import PARTS, EngineBenchmark, Part
-from ebarf_ns.events.pairs import HeldoutBlocks, PairIndex, batch_random, index_pairs
+from ebarf_ns.events.pairs import DrawAhead, HeldoutBlocks, PairIndex, batch_random, index_pairs
 from ebarf_ns.events.recording import Recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.so3 import quat_wxyz_exp, rotate
@@ -115,7 +116,7 @@ class _Engine:
         if _device() == "cuda":
             # Each corner is read, read again and added to; points and features come and go once.
             moved = count * 16 * (8 * 2 * 4 * 4 + 2 * 2 * 4) + count * 3 * 4 * 3
-            yield Figure(f"{name}, memory-bandwidth floor", 1e3 * moved / _copy_bandwidth(), "ms")
+            yield Figure(f"{name}, corner traffic at copy bandwidth", 1e3 * moved / _copy_bandwidth(), "ms")
         if find_spec("nerfstudio"):
             from ebarf_ns.nerf.comparison import hash_encoding
 
@@ -141,12 +142,10 @@ class _Engine:
             seconds = _seconds(step.once, self._repetitions)
             yield Figure(f"step of {pairs:,} pairs", 1e3 * seconds, "ms")
             yield Figure(f"pairs per second, {pairs:,} a step", pairs / seconds, "pairs/s")
-            drawn = _seconds(lambda step=step: step.draw(1), 5 * self._repetitions)
-            # On a GPU, four threads draw ahead.
-            at_once = 1 if _device() == "cpu" else 4
-            yield Figure(
-                f"sampler's speed over the step's, {pairs:,} pairs", at_once * seconds / drawn, "times", at_least=5
-            )
+            # As in training: threads of its own, one on a CPU and four beside a GPU.
+            ahead, batches = DrawAhead(step.draw, ahead=1 if _device() == "cpu" else 4), count()
+            drawn = _seconds(lambda take=ahead.batch, of=batches: take(next(of)), 20 * self._repetitions)
+            yield Figure(f"sampler's speed over the step's, {pairs:,} pairs", seconds / drawn, "times", at_least=5)
 
     def scaling(self) -> Iterator[Figure]:
         """Exponent of the seconds a step takes as one kind of work grows: 1 is linear, 0 is flat."""
@@ -210,8 +209,8 @@ class _Engine:
             scene = _demo_scene(Path(folder), 0, self.quick)
             ours, model = ebarf_rays_per_second(scene, Path(folder), 20 if self.quick else 200)
         yield Figure("ebarf, training rays per second", ours, "rays/s")
-        rays, repetitions = (64, 1) if self.quick else (4096, 3)
-        cut = "nerfacto cut down to the same grid and samples"
+        rays, repetitions = (64, 1) if self.quick else (4096, 12)
+        cut = "nerfacto with the same grid and final samples"
         for name, like, target in (("nerfacto", None, 60), (cut, model, 8)):
             theirs = nerfacto_rays_per_second(like, rays, repetitions)
             yield Figure(f"{name}, training rays per second", theirs, "rays/s")
@@ -293,7 +292,7 @@ def _device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _seconds(once: Callable[[], None], repetitions: int) -> float:
+def _seconds(once: Callable[[], object], repetitions: int) -> float:
     """Median time after two calls to warm up."""
     times = []
     for _ in range(repetitions + 2):
@@ -331,14 +330,12 @@ def _index(events: int) -> PairIndex:
 
 def _write_events(path: Path, events: int) -> None:
     with h5py.File(path, "w") as file:
-        group = file.create_group("events")
-        for name, dtype in (("x", "u2"), ("y", "u2"), ("t", "i8"), ("p", "u1")):
-            group.create_dataset(name, (events,), dtype)
+        dtypes = {"x": "u2", "y": "u2", "t": "i8", "p": "u1"}
+        x, y, t, p = (file.create_dataset(f"events/{name}", (events,), dtype) for name, dtype in dtypes.items())
         begin = 0
         for chunk in _chunks(events):
             rows = slice(begin, begin + len(chunk))
-            group["x"][rows], group["y"][rows], group["t"][rows] = chunk.x, chunk.y, chunk.t_us
-            group["p"][rows] = chunk.polarity > 0
+            x[rows], y[rows], t[rows], p[rows] = chunk.x, chunk.y, chunk.t_us, chunk.polarity > 0
             begin += len(chunk)
 
 
@@ -359,7 +356,7 @@ def _measure_index(path: Path, memory_gib: float) -> dict[str, float]:
     index = index_pairs(file.chunks, WIDTH, HEIGHT, int(memory_gib * 2**30))
     seconds = perf_counter() - started
     step = HeldoutBlocks(0, 2_000_000, 0.05)
-    batch = _seconds(lambda: index.draw_accepted(512, 30, batch_random(0, 0), step.training) and None, 30)
+    batch = _seconds(lambda: index.draw_accepted(512, 30, batch_random(0, 0), step.training), 30)
     return {"seconds": seconds, "peak_gib": peak_memory_mib() / 1024, "batch_ms": 1e3 * batch}
 
 

@@ -7,10 +7,12 @@ polarities over that order gives the sum between any two of them. Batches are a 
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,9 +73,14 @@ class PairIndex:
         """The number of pairs that many steps apart."""
         return self._count(steps)[1]
 
+    @cached_property
+    def _less_events(self) -> Int64[np.ndarray, "pixels"]:
+        """Minus the number of events of each of ``busiest``, which rises."""
+        return -np.diff(self.events_before)
+
     def _count(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels that have pairs that many steps apart, which are the first of ``busiest``, and the pairs in them."""
-        pixels = np.searchsorted(-np.diff(self.events_before), -steps)
+        pixels = np.searchsorted(self._less_events, -steps)
         return pixels, self.events_before[pixels] - steps * pixels
 
     def draw(self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator) -> EventPairs:
@@ -160,7 +167,17 @@ def index_pairs(
 
 def _file_backed(count: int) -> np.ndarray:
     # Without a name: the space is free again when the process ends, however it ends.
-    return np.memmap(tempfile.TemporaryFile(), _EVENT, "r+", shape=(count,))
+    size = count * _EVENT.itemsize
+    try:
+        file = tempfile.TemporaryFile()
+        # All of it now: a disk that turns out full when a mapped page is written ends the process without a word.
+        os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
+        return np.memmap(file, _EVENT, "r+", shape=(count,))
+    except OSError as error:
+        raise RecordingError(
+            f"{tempfile.gettempdir()}: no room for an index of {size / 2**30:.1f} GiB ({error.strerror}); "
+            "expected TMPDIR to name a larger disk, or --pipeline.datamanager.index-memory-gib to be larger"
+        ) from None
 
 
 @njit(cache=True, nogil=True)

@@ -68,10 +68,11 @@ class RecordingFile:
     def span(self) -> tuple[int, int, int]:
         """Number of events, and times of the first and last one in microseconds; between them, nothing is looked at."""
         with self._columns() as (columns, t_offset_us):
-            ends = {name: column[:: max(len(column) - 1, 1)] for name, column in columns.items()}
-            self._check(ends, 0, None)
-            start_us, end_us = int(ends["t"][0]), int(ends["t"][-1])
-            return len(columns["t"]), start_us + t_offset_us, end_us + t_offset_us
+            count = len(columns["t"])
+            first = next(self._pieces(columns, t_offset_us, 0, 1, 1))
+            before = int(first.t_us[0]) - t_offset_us
+            last = next(self._pieces(columns, t_offset_us, count - 1, count, 1, before))
+            return count, int(first.t_us[0]), int(last.t_us[0])
 
     def chunks(self, size: int = 1 << 22) -> Iterator[Recording]:
         """All events, at most ``size`` at a time."""
@@ -86,9 +87,14 @@ class RecordingFile:
             return _joined(self._pieces(columns, t_offset_us, first, last, 1 << 22))
 
     def _pieces(
-        self, columns: dict[str, h5py.Dataset], t_offset_us: int, first: int, last: int, size: int
+        self,
+        columns: dict[str, h5py.Dataset],
+        t_offset_us: int,
+        first: int,
+        last: int,
+        size: int,
+        before: int | None = None,
     ) -> Iterator[Recording]:
-        before: int | None = None
         for begin in range(first, last, size):
             piece = {name: column[begin : min(begin + size, last)] for name, column in columns.items()}
             self._check(piece, begin, before)
@@ -114,7 +120,10 @@ class RecordingFile:
                     )
                 if not lengths["t"]:
                     raise RecordingError(f"{path}: /events is empty, expected at least one event")
-                yield columns, int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
+                t_offset_us = int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
+                if abs(t_offset_us) > _MAX_TIME_US:
+                    raise RecordingError(f"{path}: /t_offset is {t_offset_us}, expected within ±{_MAX_TIME_US} us")
+                yield columns, t_offset_us
         except OSError as error:
             missing = "no such file, expected the recording"
             reason = missing if not path.exists() else f"not a readable HDF5 file ({error})"
@@ -138,7 +147,7 @@ class RecordingFile:
             ("y", (y < 0) | (y >= self.height), f"0 to {self.height - 1}, the sensor height"),
             ("p", (p < 0) | (p > 1), "0 (darker) or 1 (brighter)"),
             ("t", (t > _MAX_TIME_US) | (t < -_MAX_TIME_US), f"microseconds within ±{_MAX_TIME_US}"),
-            ("t", late, "a time not before that of the event above it"),
+            ("t", late, "a time not before those of the events above it"),
         ):
             if wrong.any():
                 row = int(wrong.argmax())

@@ -104,7 +104,9 @@ _ROTATION = (
 def _sums_of_products(a: Tensor, b: Tensor, sums: tuple[str, ...]) -> Tensor:
     """One product with a constant matrix, where written-out sums would take dozens of operations a batch."""
     products = (a[..., :, None] * b[..., None, :]).flatten(-2)
-    return products @ _matrix_of(sums, a.dtype, a.device)
+    # A product of matrices is what mixed precision rounds; poses are not to be rounded.
+    with torch.autocast(a.device.type, enabled=False):
+        return products @ _matrix_of(sums, products.dtype, a.device)
 
 
 @lru_cache

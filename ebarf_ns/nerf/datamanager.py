@@ -13,6 +13,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import EbarfError, RecordingError, one_line_errors
@@ -111,6 +112,11 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
 
     @cached_property
+    def rank(self) -> int:
+        """Number of this process among those that train together, on however many machines."""
+        return comms.get_rank()
+
+    @cached_property
     def span_us(self) -> tuple[int, int]:
         """The time in which there are both events and poses; events outside are counted and left out."""
         scene: Scene = self.train_dataset.scene
@@ -143,6 +149,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def _training_batches(self) -> DrawAhead:
+        # Before there are threads: each of them would make one of its own.
+        _ = self.index
         ahead = 1 if torch.device(self.device).type == "cpu" else 4
         return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
 
@@ -175,7 +183,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.train_count += 1
         batch = step if self.test_mode == "val" else self.train_count
         with one_line_errors():
-            return self._rays(self._training_batches.batch(batch * self.world_size + self.local_rank))
+            return self._rays(self._training_batches.batch(batch * self.world_size + self.rank))
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
         """Rays of the held-out pairs, the same for every step, method and seed."""

@@ -27,7 +27,8 @@ T = TypeVar("T")
 
 def _planned(value: T | None) -> T:
     """A value that the trainer's plan has filled in."""
-    assert value is not None
+    if value is None:
+        raise TrainingError("this run's config.yml lacks values of its plan: it is of an earlier version of ebarf_ns")
     return value
 
 

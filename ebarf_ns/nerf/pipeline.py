@@ -80,7 +80,7 @@ class EbarfPipeline(VanillaPipeline):
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
-        self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.local_rank)
+        self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.rank)
         return super().get_train_loss_dict(step)
 
     def trajectory(self, refined: bool = True) -> Trajectory:

@@ -3,6 +3,7 @@
 import json
 import platform
 from dataclasses import asdict, dataclass, field
+from functools import reduce
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -27,11 +28,21 @@ from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.pipeline import EbarfPipeline
-from ebarf_ns.plan import apply_plan, plan_for
+from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
-from ebarf_ns.scene import read_scene
+from ebarf_ns.scene import check_bounds, read_scene
 
 _SKIPPED_IN_A_ROW = 10
+_LEAST = {
+    "machine.seed": 0,
+    "pipeline.datamanager.train_num_rays_per_batch": 2,
+    "pipeline.datamanager.eval_num_rays_per_batch": 2,
+    "pipeline.datamanager.longest_pair": 1,
+    "pipeline.datamanager.index_memory_gib": 1e-6,
+    "pipeline.model.grid_coarsest": 2,
+    "pipeline.model.near": 1e-6,
+    "pipeline.model.samples": 1,
+}
 
 
 @dataclass
@@ -123,6 +134,7 @@ class EbarfTrainer(Trainer):
                 value = getattr(self.config, flag)
                 if value is not None and not value > 0:
                     raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected more than 0")
+            self._check_settings()
             self._plan()
             super().setup(test_mode)
             if self.progress() >= 1:
@@ -131,15 +143,36 @@ class EbarfTrainer(Trainer):
                     "expected a larger --max-num-iterations or --max-train-seconds to go on"
                 )
 
+    def _check_settings(self) -> None:
+        for flag, least in _LEAST.items():
+            value = reduce(getattr, flag.split("."), self.config)
+            if value is not None and not value >= least:
+                raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
+
     def _plan(self) -> None:
         """Fill in what the configuration leaves to the plan, and keep it with the run."""
         datamanager = self.config.pipeline.datamanager
         folder = datamanager.data or datamanager.dataparser.data  # pyright: ignore[reportAttributeAccessIssue]
         scene = read_scene(Path(folder))
+        trajectory = read_tum(scene.trajectory)
+        check_bounds(scene, trajectory)
         events, _, _ = RecordingFile(scene.events, scene.camera.width, scene.camera.height).span()
         device = "cuda" if self.device.startswith("cuda") else "cpu"
-        self.plan = apply_plan(plan_for(scene, read_tum(scene.trajectory), events, device), self.config)
+        model: Any = self.config.pipeline.model
+        lines = plan_for(scene, trajectory, events, device, model.grid_coarsest, model.grid_finest)
+        self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
         self._keep_plan()
+
+    def _lines_of_resumed_run(self, lines: list[Line]) -> list[Line]:
+        """The plan that a loaded checkpoint was made by, whatever would be planned on this machine today."""
+        loaded = self._loaded_path()
+        kept = loaded.parent.parent / "config.yml" if loaded else None
+        if kept is None or not kept.is_file():
+            return lines
+        before = yaml.load(kept.read_text(encoding="utf-8"), Loader=yaml.Loader)
+        values = [reduce(lambda part, name: getattr(part, name, None), line.field.split("."), before) for line in lines]
+        pairs = zip(lines, values, strict=True)
+        return [line if value is None else Line(line.field, value, "as in the run resumed") for line, value in pairs]
 
     @check_main_thread
     def _keep_plan(self) -> None:
@@ -309,6 +342,8 @@ class EbarfTrainer(Trainer):
         if self.config.load_dir is not None:
             steps = sorted(self.config.load_dir.glob("step-*.ckpt"))
             step = self.config.load_step
+            if step is None and not steps:
+                raise TrainingError(f"{self.config.load_dir}: holds no step-*.ckpt, expected a run's checkpoints")
             return self.config.load_dir / f"step-{step:09d}.ckpt" if step is not None else steps[-1]
         return self.config.load_checkpoint
 

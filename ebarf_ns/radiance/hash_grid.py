@@ -8,7 +8,8 @@ The lattice and the table's order are tiny-cuda-nn's, so that a trained table me
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
+from functools import lru_cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -71,7 +72,7 @@ class Lattice(nn.Module):
         self.register_buffer("stretch", torch.tensor(shape.scales).float() * shape.reach, persistent=False)
         self.register_buffer("resolution", torch.tensor(shape.resolutions), persistent=False)
         self.register_buffer("first_row", torch.tensor([0, *np.cumsum(shape.rows)]), persistent=False)
-        self.register_buffer("level_weight", torch.ones(shape.levels), persistent=False)
+        self.register_buffer("level_weight", torch.ones(shape.levels))
         self.stretch: Tensor
         """Cells of each level across the unit cube, float32 of the levels."""
         self.resolution: Tensor
@@ -128,8 +129,18 @@ def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
     if point.dtype == torch.float32 and point.device.type == "cpu":
         return "numba"
     if point.dtype == torch.float32 and point.is_cuda:
-        return "tcnn" if find_spec("tinycudann") else "triton" if find_spec("triton") else "torch"
+        return "tcnn" if _importable("tinycudann") else "triton" if _importable("triton") else "torch"
     return "torch"
+
+
+@lru_cache
+def _importable(name: str) -> bool:
+    """Whether it is there and fits this machine: tiny-cuda-nn raises errors of its own on GPUs it was not built for."""
+    try:
+        import_module(name)
+    except Exception:
+        return False
+    return True
 
 
 _encodings: dict[HashGridShape, nn.Module] = {}

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from ebarf_ns.radiance.hash_grid import Lattice
 
+# All of fastmath but the promise that there are no infinities and nothing that is not a number.
+_FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
 _BLOCK = 1024  # points whose features stay in cache while all levels are visited
 
 
@@ -54,10 +56,14 @@ class _Encoding(torch.autograd.Function):
 
 @njit(cache=True, inline="always")
 def _cell(coordinate, stretch, vertices):
-    """Cell number along one axis and the place in it; points outside are moved to the face."""
-    place = min(max(coordinate, np.float32(0)), np.float32(1)) * stretch + np.float32(0.5)
-    cell = min(np.int32(place), np.int32(vertices - 2))
-    return np.uint32(cell), place - np.float32(cell)
+    """Cell number along one axis and the place in it; points outside are moved to the face.
+
+    What is not a number is given the last cell, and stays what it is: the features show it.
+    """
+    inside = np.float32(0) if coordinate < 0 else np.float32(1) if coordinate > 1 else coordinate
+    place = inside * stretch + np.float32(0.5)
+    cell = np.uint32(place) if place < np.float32(vertices - 1) else np.uint32(vertices - 2)
+    return cell, place - np.float32(cell)
 
 
 @njit(cache=True, inline="always")
@@ -85,7 +91,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
     The eight corners are written out: sums then stay in registers, where a loop over them would go through memory.
     """
 
-    @njit(cache=True, parallel=True, fastmath=True, nogil=True, error_model="numpy")
+    @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
     def forward(point, table, stretch, resolution, first_row, level_weight, encoded):
         for block in prange((len(point) + _BLOCK - 1) // _BLOCK):
             begin, end = block * _BLOCK, min(len(point), (block + 1) * _BLOCK)
@@ -110,7 +116,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
                             w00 * values[r0, f] + w10 * values[r1, f] + w01 * values[r2, f] + w11 * values[r3, f]
                         ) + fz * (w00 * values[r4, f] + w10 * values[r5, f] + w01 * values[r6, f] + w11 * values[r7, f])
 
-    @njit(cache=True, parallel=True, fastmath=True, nogil=True, error_model="numpy")
+    @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
     def backward(point, table, stretch, resolution, first_row, level_weight, gradient, table_gradient, point_gradient):
         with_points = point_gradient.shape[1] > 0
         levels = len(resolution)

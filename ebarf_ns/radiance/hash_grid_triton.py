@@ -60,8 +60,11 @@ class _Encoding(torch.autograd.Function):
 
 @triton.jit
 def _cell(coordinate, stretch, vertices):
-    place = tl.minimum(tl.maximum(coordinate, 0.0), 1.0) * stretch + 0.5
-    cell = tl.minimum(place.to(tl.int32), (vertices - 2).to(tl.int32))
+    """As in the numba kernels: what is not a number is given the last cell, and stays what it is."""
+    inside = tl.where(coordinate < 0, 0.0, tl.where(coordinate > 1, 1.0, coordinate))
+    place = inside * stretch + 0.5
+    known = place < (vertices - 1).to(tl.float32)
+    cell = tl.where(known, tl.where(known, place, 0.0).to(tl.int32), (vertices - 2).to(tl.int32))
     return cell, place - cell.to(tl.float32)
 
 

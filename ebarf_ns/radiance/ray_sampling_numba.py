@@ -8,7 +8,11 @@ import numpy as np
 import torch
 from numba import njit, prange
 
+from ebarf_ns.radiance.hash_grid_numba import _FAST
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Float
     from torch import Tensor
 
@@ -30,10 +34,21 @@ def importance_edges(
     edges = torch.empty(len(far), samples + 1)
     sharing = 2 if pairs else 1
     columns = (rays.origin.contiguous(), rays.direction.contiguous(), far, jitter[:, 0], grid.density)
-    arrays = [column.detach().numpy() for column in columns]
+    origin, direction, ends, shift, density = (column.detach().numpy() for column in columns)
+    settings = np.float32(near), grid.half_side, grid.cells, np.float32(uniform_share)
     scratch = np.empty((len(far) // sharing, coarse + 1), np.float32)
-    _place(*arrays, np.float32(near), grid.half_side, grid.cells, np.float32(uniform_share), scratch, edges.numpy())
+    place: Callable[..., None] = _place
+    place(origin, direction, ends, shift, density, *settings, scratch, edges.numpy())
     return edges
+
+
+@njit(cache=True, inline="always")
+def _along(coordinate, half_side, cells):
+    """Cell number along one axis; what is not a number goes to the first, as what lies below does."""
+    place = (coordinate + np.float32(half_side)) * np.float32(cells / (2 * half_side))
+    if place > 0:
+        return np.int64(place) if place < cells else np.int64(cells - 1)
+    return np.int64(0)
 
 
 @njit(cache=True, inline="always")
@@ -44,14 +59,11 @@ def _cell(x, y, z, half_side, cells):
         if size > 1:
             squeeze = (2 - 1 / size) / size
             x, y, z = x * squeeze, y * squeeze, z * squeeze
-    scale, last = np.float32(cells / (2 * half_side)), np.float32(cells - 1)
-    ix = np.int32(min(max((x + np.float32(half_side)) * scale, np.float32(0)), last))
-    iy = np.int32(min(max((y + np.float32(half_side)) * scale, np.float32(0)), last))
-    iz = np.int32(min(max((z + np.float32(half_side)) * scale, np.float32(0)), last))
+    ix, iy, iz = _along(x, half_side, cells), _along(y, half_side, cells), _along(z, half_side, cells)
     return ix + cells * (iy + cells * iz)
 
 
-@njit(cache=True, parallel=True, fastmath=True, nogil=True, error_model="numpy")
+@njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
 def _place(origin, direction, far, jitter, density, near, half_side, cells, uniform_share, cumulative, edges):
     groups, coarse = len(cumulative), cumulative.shape[1] - 1
     sharing, samples = len(far) // max(groups, 1), edges.shape[1] - 1

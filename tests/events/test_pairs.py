@@ -165,3 +165,12 @@ def test_accumulated_picture_shows_polarity():
     )  # fmt: skip
     picture = accumulate(events, WIDTH, HEIGHT)
     assert picture[0, 1] > 128 > picture[1, 2] and picture[2, 3] == 128
+
+
+def test_no_room_for_the_file_of_an_index_is_said(monkeypatch: pytest.MonkeyPatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    with pytest.raises(RecordingError, match="no room for an index of .*TMPDIR"):
+        index_of(recording(0, 300), memory_bytes=16)

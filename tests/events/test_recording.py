@@ -128,3 +128,18 @@ def test_between_includes_both_ends(tmp_path: Path):
     recording = read_recording(write(tmp_path / "e.h5"), WIDTH, HEIGHT)
     assert len(recording.between(10, 10)) == 2 and len(recording.between(11, 2500)) == 1
     assert len(recording.between(11, 12)) == 0
+
+
+def test_the_span_is_checked_without_reading_what_lies_between(tmp_path: Path):
+    file = RecordingFile(write(tmp_path / "e.h5", t=[10, 2500, 5]), WIDTH, HEIGHT)
+    with pytest.raises(RecordingError, match="/events/t row 2 is 5, expected a time not before"):
+        file.span()
+    assert RecordingFile(write(tmp_path / "f.h5", t_offset=7), WIDTH, HEIGHT).span() == (3, 17, 2507)
+
+
+def test_an_offset_beyond_all_time_is_named(tmp_path: Path):
+    path = write(tmp_path / "e.h5")
+    with h5py.File(path, "a") as file:
+        file["t_offset"] = np.uint64(2**63 + 5)
+    with pytest.raises(RecordingError, match="/t_offset is 9223372036854775813, expected within"):
+        read_recording(path, WIDTH, HEIGHT)

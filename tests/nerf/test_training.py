@@ -3,6 +3,7 @@
 import copy
 import json
 import shutil
+from functools import reduce
 from pathlib import Path
 
 import pytest
@@ -260,3 +261,35 @@ def test_levels_come_in_over_the_fraction_asked_for(tiny_scene: Path, tmp_path: 
         weights.append(model.renderer.field.grid.lattice.level_weight.tolist())
     assert weights[0] == [1, 1, 0, 0] and weights[2] == weights[3] == [1, 1, 1, 1]
     assert weights[1][2] == 1 and 0.4 < weights[1][3] < 0.6
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value"),
+    [("machine", "seed", -1), ("pipeline.datamanager", "longest_pair", 0), ("pipeline.model", "near", 0.0),
+     ("pipeline.datamanager", "train_num_rays_per_batch", 1), ("pipeline.datamanager", "index_memory_gib", 0.0)],
+)  # fmt: skip
+def test_settings_that_make_no_sense_are_named(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], part: str, field: str, value: float
+):
+    made = config(tiny_scene, tmp_path)
+    setattr(reduce(getattr, part.split("."), made), field, value)
+    with pytest.raises(SystemExit):
+        trainer(made)
+    assert f"--{part}.{field}".replace("_", "-") + f" is {value}, expected at least" in capsys.readouterr().err
+
+
+def test_a_resumed_run_keeps_its_plan(tiny_scene: Path, tmp_path: Path):
+    made = config(tiny_scene, tmp_path / "first")
+    made.pipeline.model.grid_finest = 77  # pyright: ignore[reportAttributeAccessIssue]
+    first = trainer(made)
+    first.pipeline.train()
+    first.train_iteration(0)
+    first.save_checkpoint(0)
+    again = config(tiny_scene, tmp_path / "second")
+    again.load_dir = first.checkpoint_dir
+    for name in ("grid_finest", "samples"):
+        setattr(again.pipeline.model, name, None)
+    second = trainer(again)
+    assert second.pipeline.model.renderer.field.grid.shape.finest == 77
+    reasons = {line.field: line.reason for line in second.plan}
+    assert reasons["pipeline.model.grid_finest"] == "as in the run resumed"
