@@ -85,8 +85,8 @@ def plan_for(
         ),
         Line(
             "pipeline.model.density_cells",
-            int(np.clip(finest // 2, 32, 128)),
-            "half the finest resolution, within 32 and 128",
+            int(np.clip(finest, 32, 128)),
+            "as the finest level, up to 128: the better remembered, the fewer samples do",
         ),
         Line(
             "pipeline.model.samples",

@@ -70,9 +70,11 @@ def resample(
 class DensityGrid(nn.Module):
     """A coarse memory of the field's density, so that finding out where to look costs no pass through the field."""
 
-    def __init__(self, cells: int, bounded: bool, refresh_share: int = 16):
+    def __init__(self, cells: int, bounded: bool):
         super().__init__()
-        self.cells, self.half_side, self.refresh_share = cells, 1.0 if bounded else 2.0, refresh_share
+        self.cells, self.half_side = cells, 1.0 if bounded else 2.0
+        # So that keeping it up to date costs no more than some 65,536 points at a time.
+        self.refresh_share = max(16, cells**3 >> 16)
         self.register_buffer("density", torch.ones(cells**3))
         self.density: Tensor
 
