@@ -109,15 +109,20 @@ def _page(header: dict[str, Any], evaluations: list[dict[str, Any]], report: Pat
         for path in renders
     )
     svgs = "".join((report / name).read_text(encoding="utf-8") for name in ("trajectory.svg", "work_precision.svg"))
-    facts = html.escape(", ".join(f"{key} {value}" for key, value in header.items()))
+    facts = html.escape(", ".join(f"{key} {value}" for key, value in header.items() if key != "plan"))
+    plan = "".join(
+        f"<tr><td class=text>{html.escape(field)}<td>{_cell(line['value'])}<td class=text>{html.escape(line['reason'])}"
+        for field, line in header.get("plan", {}).items()
+    )
     return f"""<!doctype html><meta charset="utf-8"><title>{html.escape(report.parent.name)}</title>
 <style>body{{font:14px sans-serif;max-width:70rem;margin:2rem auto}}svg{{max-width:100%;height:auto}}
-td,th{{padding:.1rem .6rem;text-align:right}}figure{{display:inline-block;margin:.3rem}}img{{width:24rem;
-image-rendering:pixelated}}</style>
+td,th{{padding:.1rem .6rem;text-align:right}}.text{{text-align:left}}figure{{display:inline-block;margin:.3rem}}
+img{{width:24rem;image-rendering:pixelated}}</style>
 <h1>{html.escape(str(header.get("method", "run")))}</h1><p>{facts}</p>
 <h2>Trajectory</h2><p>Aligned to the reference where there is one (by orientation and scale).</p>{svgs}
 <h2>Evaluations</h2><table><tr>{"".join(f"<th>{html.escape(key)}</th>" for key in columns)}</tr>{rows}</table>
 <h2>Views at the refined poses</h2>{pictures or "<p>The scene has no frames to compare with.</p>"}
+<h2>Plan</h2><table>{plan}</table>
 """
 
 

@@ -91,7 +91,8 @@ class HashGrid(nn.Module):
         self.shape = shape
         self.carrier: Carrier | None = carrier
         self.lattice = Lattice(shape)
-        self.table = nn.Parameter(torch.empty(sum(shape.rows), shape.features))
+        # By numpy, which asks for large pages.
+        self.table = nn.Parameter(torch.from_numpy(np.empty((sum(shape.rows), shape.features), np.float32)))
         self.reset()
 
     def reset(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,20 @@ if TYPE_CHECKING:
 
 # All of fastmath but the promise that there are no infinities and nothing that is not a number.
 _FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
-_BLOCK = 1024  # points whose features stay in cache while all levels are visited
+_BLOCK = 8192
+_gradients: dict[tuple[int, ...], np.ndarray] = {}
+
+
+def _recycled(shape: tuple[int, ...]) -> Tensor:
+    """Memory for a table's gradient: the last one's where nobody holds it any more, so that no step has to ask for it.
+
+    Memory handed out anew costs more than what is computed in it; numpy also asks for large pages.
+    """
+    array = _gradients.get(shape)
+    # Known here by the pool, the name, and the question itself; every tensor in it adds one.
+    if array is None or sys.getrefcount(array) > 3:
+        array = _gradients[shape] = np.empty(shape, np.float32)
+    return torch.from_numpy(array)
 
 
 def encode(
@@ -44,7 +58,7 @@ class _Encoding(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         point, table, *levels = ctx.saved_tensors
-        table_gradient = torch.empty_like(table)
+        table_gradient = _recycled(tuple(table.shape))
         # Each level writes a plane of its own, so that levels can run in parallel.
         point_gradient = torch.empty(len(levels[0]), len(point) if ctx.needs_input_grad[0] else 0, 3)
         _, backward = _kernels(table.shape[1])
@@ -84,6 +98,12 @@ def _corner_rows(ix, iy, iz, vertices, rows):
     )  # fmt: skip
 
 
+@njit(cache=True, inline="always")
+def _level(k, levels):
+    """Threads take runs of k: alternate ends, so that each gets cheap coarse and costly fine levels."""
+    return k // 2 if k % 2 == 0 else levels - 1 - k // 2
+
+
 @lru_cache
 def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
     """Forward and backward kernels for a number of features a level, which the compiler unrolls.
@@ -93,36 +113,37 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
 
     @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
     def forward(point, table, stretch, resolution, first_row, level_weight, encoded):
-        for block in prange((len(point) + _BLOCK - 1) // _BLOCK):
+        levels, blocks = len(resolution), (len(point) + _BLOCK - 1) // _BLOCK
+        for task in prange(levels * blocks):
+            # All blocks of a level after one another, so that its rows stay in cache.
+            level, block = _level(task // blocks, levels), task % blocks
             begin, end = block * _BLOCK, min(len(point), (block + 1) * _BLOCK)
-            for level in range(len(resolution)):
-                vertices, scale, weight = resolution[level], stretch[level], level_weight[level]
-                start, rows = first_row[level], first_row[level + 1] - first_row[level]
-                first = level * features
-                if weight == 0:
-                    encoded[begin:end, first : first + features] = 0
-                    continue
-                values = table[start : start + rows]
-                for i in range(begin, end):
-                    ix, fx = _cell(point[i, 0], scale, vertices)
-                    iy, fy = _cell(point[i, 1], scale, vertices)
-                    iz, fz = _cell(point[i, 2], scale, vertices)
-                    r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(ix, iy, iz, vertices, rows)
-                    gx, gy, gz = 1 - fx, 1 - fy, weight * (1 - fz)
-                    fz = weight * fz
-                    w00, w10, w01, w11 = gx * gy, fx * gy, gx * fy, fx * fy
-                    for f in range(features):
-                        encoded[i, first + f] = gz * (
-                            w00 * values[r0, f] + w10 * values[r1, f] + w01 * values[r2, f] + w11 * values[r3, f]
-                        ) + fz * (w00 * values[r4, f] + w10 * values[r5, f] + w01 * values[r6, f] + w11 * values[r7, f])
+            vertices, scale, weight = resolution[level], stretch[level], level_weight[level]
+            start, rows = first_row[level], first_row[level + 1] - first_row[level]
+            first = level * features
+            if weight == 0:
+                encoded[begin:end, first : first + features] = 0
+                continue
+            values = table[start : start + rows]
+            for i in range(begin, end):
+                ix, fx = _cell(point[i, 0], scale, vertices)
+                iy, fy = _cell(point[i, 1], scale, vertices)
+                iz, fz = _cell(point[i, 2], scale, vertices)
+                r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(ix, iy, iz, vertices, rows)
+                gx, gy, gz = 1 - fx, 1 - fy, weight * (1 - fz)
+                fz = weight * fz
+                w00, w10, w01, w11 = gx * gy, fx * gy, gx * fy, fx * fy
+                for f in range(features):
+                    encoded[i, first + f] = gz * (
+                        w00 * values[r0, f] + w10 * values[r1, f] + w01 * values[r2, f] + w11 * values[r3, f]
+                    ) + fz * (w00 * values[r4, f] + w10 * values[r5, f] + w01 * values[r6, f] + w11 * values[r7, f])
 
     @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
     def backward(point, table, stretch, resolution, first_row, level_weight, gradient, table_gradient, point_gradient):
         with_points = point_gradient.shape[1] > 0
         levels = len(resolution)
         for k in prange(levels):
-            # Threads take runs of k: alternate ends, so that each gets cheap coarse and costly fine levels.
-            level = k // 2 if k % 2 == 0 else levels - 1 - k // 2
+            level = _level(k, levels)
             vertices, scale, weight = resolution[level], stretch[level], level_weight[level]
             start, rows = first_row[level], first_row[level + 1] - first_row[level]
             first = level * features

@@ -60,6 +60,7 @@ def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):
     assert numbers["method"] == "ebarf" and numbers["step"] == 80
     page = Path(numbers["report"]).read_text()
     assert "data:image/png;base64," in page and "<svg" in page and "http" not in page.split("</style>")[0]
+    assert "pipeline.model.grid_levels" in page and "Eq. 5" in page
 
 
 def test_simulate_with_a_knob(tmp_path: Path):

@@ -89,6 +89,20 @@ def test_levels_come_in_by_their_weight_and_closed_ones_neither_give_nor_take(ca
     assert torch.allclose(half, torch.full_like(half, 0.5), atol=1e-4)
 
 
+def test_gradients_that_are_still_held_are_never_written_over():
+    grid, point = made(SHAPES[0], "numba"), random_points(200)
+    first, second = (torch.autograd.grad(k * grid(point).sum(), grid.table)[0] for k in (1, 2))
+    assert torch.allclose(2 * first, second) and first.data_ptr() != second.data_ptr()
+    (3 * grid(point)).sum().backward()
+    (3 * grid(point)).sum().backward()
+    assert grid.table.grad is not None and torch.allclose(6 * first, grid.table.grad, rtol=1e-5)
+    kept = second.data_ptr()
+    del first, second
+    grid.zero_grad()
+    (third,) = torch.autograd.grad(grid(point).sum(), grid.table)
+    assert third.data_ptr() == kept or third.abs().sum() > 0
+
+
 @pytest.mark.parametrize("carrier", CARRIERS)
 def test_outside_the_cube_nothing_pulls(carrier: Carrier):
     point = torch.tensor([[1.5, 0.3, -0.2]], requires_grad=True)
