@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 # All of fastmath but the promise that there are no infinities and nothing that is not a number.
 _FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
-_BLOCK = 8192
+_BLOCK = 128
+# Numbers of a level that a core's own cache holds; larger levels are looked at ahead.
+_CACHED = 1 << 17
 _gradients: dict[tuple[int, ...], np.ndarray] = {}
 
 
@@ -104,6 +106,23 @@ def _level(k, levels):
     return k // 2 if k % 2 == 0 else levels - 1 - k // 2
 
 
+@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+def _touch(point, array, begin, end, scale, vertices, rows):
+    """Look at all rows that a block of points will need.
+
+    Looks that depend on nothing wait for memory together; in the midst of arithmetic each waits by itself.
+    """
+    total = np.float32(0)
+    for i in range(begin, end):
+        ix, _ = _cell(point[i, 0], scale, vertices)
+        iy, _ = _cell(point[i, 1], scale, vertices)
+        iz, _ = _cell(point[i, 2], scale, vertices)
+        r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(ix, iy, iz, vertices, rows)
+        total += array[r0, 0] + array[r1, 0] + array[r2, 0] + array[r3, 0]
+        total += array[r4, 0] + array[r5, 0] + array[r6, 0] + array[r7, 0]
+    return total
+
+
 @lru_cache
 def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
     """Forward and backward kernels for a number of features a level, which the compiler unrolls.
@@ -114,6 +133,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
     @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
     def forward(point, table, stretch, resolution, first_row, level_weight, encoded):
         levels, blocks = len(resolution), (len(point) + _BLOCK - 1) // _BLOCK
+        touched = np.empty(levels * blocks, np.float32)
         for task in prange(levels * blocks):
             # All blocks of a level after one another, so that its rows stay in cache.
             level, block = _level(task // blocks, levels), task % blocks
@@ -125,6 +145,8 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
                 encoded[begin:end, first : first + features] = 0
                 continue
             values = table[start : start + rows]
+            if rows * features > _CACHED:
+                touched[task] = _touch(point, values, begin, end, scale, vertices, rows)
             for i in range(begin, end):
                 ix, fx = _cell(point[i, 0], scale, vertices)
                 iy, fy = _cell(point[i, 1], scale, vertices)
@@ -142,6 +164,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
     def backward(point, table, stretch, resolution, first_row, level_weight, gradient, table_gradient, point_gradient):
         with_points = point_gradient.shape[1] > 0
         levels = len(resolution)
+        touched = np.zeros(levels, np.float32)
         for k in prange(levels):
             level = _level(k, levels)
             vertices, scale, weight = resolution[level], stretch[level], level_weight[level]
@@ -152,41 +175,46 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
             if weight == 0:
                 point_gradient[level] = 0
                 continue
-            for i in range(len(point)):
-                ix, fx = _cell(point[i, 0], scale, vertices)
-                iy, fy = _cell(point[i, 1], scale, vertices)
-                iz, fz = _cell(point[i, 2], scale, vertices)
-                r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(ix, iy, iz, vertices, rows)
-                gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
-                w00, w10, w01, w11 = gx * gy, fx * gy, gx * fy, fx * fy
-                a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = np.float32(0)
-                for f in range(features):
-                    g = weight * gradient[i, first + f]
-                    a0 += g * values[r0, f]
-                    a1 += g * values[r1, f]
-                    a2 += g * values[r2, f]
-                    a3 += g * values[r3, f]
-                    a4 += g * values[r4, f]
-                    a5 += g * values[r5, f]
-                    a6 += g * values[r6, f]
-                    a7 += g * values[r7, f]
-                    lower, upper = gz * g, fz * g
-                    sums[r0, f] += w00 * lower
-                    sums[r1, f] += w10 * lower
-                    sums[r2, f] += w01 * lower
-                    sums[r3, f] += w11 * lower
-                    sums[r4, f] += w00 * upper
-                    sums[r5, f] += w10 * upper
-                    sums[r6, f] += w01 * upper
-                    sums[r7, f] += w11 * upper
-                if with_points:
-                    b0, b1, b2, b3 = gz * a0 + fz * a4, gz * a1 + fz * a5, gz * a2 + fz * a6, gz * a3 + fz * a7
-                    along_x = scale * (gy * (b1 - b0) + fy * (b3 - b2))
-                    along_y = scale * (gx * (b2 - b0) + fx * (b3 - b1))
-                    along_z = scale * (w00 * (a4 - a0) + w10 * (a5 - a1) + w01 * (a6 - a2) + w11 * (a7 - a3))
-                    # Whoever was moved to a face feels nothing across it.
-                    point_gradient[level, i, 0] = along_x if 0 <= point[i, 0] <= 1 else np.float32(0)
-                    point_gradient[level, i, 1] = along_y if 0 <= point[i, 1] <= 1 else np.float32(0)
-                    point_gradient[level, i, 2] = along_z if 0 <= point[i, 2] <= 1 else np.float32(0)
+            for begin in range(0, len(point), _BLOCK):
+                end = min(len(point), begin + _BLOCK)
+                if rows * features > _CACHED:
+                    touched[k] += _touch(point, values, begin, end, scale, vertices, rows)
+                    touched[k] += _touch(point, sums, begin, end, scale, vertices, rows)
+                for i in range(begin, end):
+                    ix, fx = _cell(point[i, 0], scale, vertices)
+                    iy, fy = _cell(point[i, 1], scale, vertices)
+                    iz, fz = _cell(point[i, 2], scale, vertices)
+                    r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(ix, iy, iz, vertices, rows)
+                    gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
+                    w00, w10, w01, w11 = gx * gy, fx * gy, gx * fy, fx * fy
+                    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = np.float32(0)
+                    for f in range(features):
+                        g = weight * gradient[i, first + f]
+                        a0 += g * values[r0, f]
+                        a1 += g * values[r1, f]
+                        a2 += g * values[r2, f]
+                        a3 += g * values[r3, f]
+                        a4 += g * values[r4, f]
+                        a5 += g * values[r5, f]
+                        a6 += g * values[r6, f]
+                        a7 += g * values[r7, f]
+                        lower, upper = gz * g, fz * g
+                        sums[r0, f] += w00 * lower
+                        sums[r1, f] += w10 * lower
+                        sums[r2, f] += w01 * lower
+                        sums[r3, f] += w11 * lower
+                        sums[r4, f] += w00 * upper
+                        sums[r5, f] += w10 * upper
+                        sums[r6, f] += w01 * upper
+                        sums[r7, f] += w11 * upper
+                    if with_points:
+                        b0, b1, b2, b3 = gz * a0 + fz * a4, gz * a1 + fz * a5, gz * a2 + fz * a6, gz * a3 + fz * a7
+                        along_x = scale * (gy * (b1 - b0) + fy * (b3 - b2))
+                        along_y = scale * (gx * (b2 - b0) + fx * (b3 - b1))
+                        along_z = scale * (w00 * (a4 - a0) + w10 * (a5 - a1) + w01 * (a6 - a2) + w11 * (a7 - a3))
+                        # Whoever was moved to a face feels nothing across it.
+                        point_gradient[level, i, 0] = along_x if 0 <= point[i, 0] <= 1 else np.float32(0)
+                        point_gradient[level, i, 1] = along_y if 0 <= point[i, 1] <= 1 else np.float32(0)
+                        point_gradient[level, i, 2] = along_z if 0 <= point[i, 2] <= 1 else np.float32(0)
 
     return forward, backward
