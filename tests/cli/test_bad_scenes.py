@@ -57,7 +57,7 @@ def scaled_times(factor: float) -> Callable[[list[str]], list[str]]:
 CASES = {
     "no events file": (lambda scene: (scene / "events.h5").unlink(), "no such file, expected the recording"),
     "wrong key": (edit_json(evnets=1), "unknown key evnets"),
-    "unsorted": (edit_column("t", lambda t: t[::-1]), "/events/t row 1 is"),
+    "unsorted": (edit_column("t", lambda t: t[::-1]), "expected a time not before those of the events above it"),
     "ragged": (edit_column("x", lambda x: x[:-1]), "differ in length"),
     "outside the sensor": (edit_column("x", at(7, 48)), "/events/x row 7 is 48, expected 0 to 47"),
     "polarity": (edit_column("p", at(3, 2)), "/events/p row 3 is 2, expected 0 (darker) or 1 (brighter)"),
