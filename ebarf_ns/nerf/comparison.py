@@ -17,7 +17,6 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from torch import nn
 
 if TYPE_CHECKING:
-    from ebarf_ns.nerf.model import EbarfModelConfig
     from ebarf_ns.radiance.hash_grid import HashGridShape
 
 
@@ -34,8 +33,8 @@ def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.
     return encoding, list(encoding.parameters())
 
 
-def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float, EbarfModelConfig]:
-    """Of the registered method, through the trainer, on a scene, and the model as planned for it.
+def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float, dict[str, int]]:
+    """Of the registered method, through the trainer, on a scene; and nerfacto's names for the grid planned for it.
 
     The first half of the steps warms up; of the others the mean counts, because every eighth does more.
     """
@@ -56,25 +55,23 @@ def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float,
         trainer.train_iteration(step)
         times.append(_now() - started)
     seconds = sum(times[steps // 2 :]) / (steps - steps // 2)
-    return trainer.pipeline.datamanager.get_train_rays_per_batch() / seconds, trainer.pipeline.model.config
+    model = trainer.pipeline.model.config
+    shape = {
+        "num_levels": model.grid_levels,
+        "features_per_level": model.grid_features,
+        "base_res": model.grid_coarsest,
+        "max_res": model.grid_finest,
+        "log2_hashmap_size": model.grid_table_size_log2,
+        "num_nerf_samples_per_ray": model.samples,
+    }
+    return trainer.pipeline.datamanager.get_train_rays_per_batch() / seconds, shape
 
 
-def nerfacto_rays_per_second(like: EbarfModelConfig | None, rays: int, repetitions: int) -> float:
+def nerfacto_rays_per_second(shape: dict[str, Any], rays: int, repetitions: int) -> float:
     """Of stock nerfacto in torch: rays to updated parameters, without its data manager, on the device that ebarf takes.
 
-    Its proposal networks are trained as seldom as they are after 5,000 steps. With ``like``, its field gets the grid
-    and the number of samples a ray of that configuration; its proposal networks stay as they are.
+    Its proposal networks are trained as seldom as they are after 5,000 steps. ``shape`` changes its configuration.
     """
-    shape: dict[str, Any] = {}
-    if like:
-        shape = {
-            "num_levels": like.grid_levels,
-            "features_per_level": like.grid_features,
-            "base_res": like.grid_coarsest,
-            "max_res": like.grid_finest,
-            "log2_hashmap_size": like.grid_table_size_log2,
-            "num_nerf_samples_per_ray": like.samples,
-        }
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = _without_lpips(NerfactoModelConfig(implementation="torch", **shape)).to(device)
     optimizers = [torch.optim.Adam(group, lr=1e-2, eps=1e-15) for group in model.get_param_groups().values() if group]
