@@ -5,8 +5,6 @@ python tools/benchmark.py OUTPUT.json --methods ebarf enerf --seconds 100 --seed
 
 import argparse
 import json
-import os
-import platform
 import shlex
 import statistics
 import subprocess
@@ -15,6 +13,8 @@ import tempfile
 from datetime import date
 from pathlib import Path
 from typing import Any
+
+from ebarf_ns.benchmarks.engine import machine
 
 COLUMNS = {
     "heldout_event_loss": "unexplained events",
@@ -30,14 +30,6 @@ def run(*words: object) -> None:
     """Run a console script of this environment."""
     name, *arguments = map(str, words)
     subprocess.run([Path(sys.executable).parent / name, *arguments], check=True, stdout=subprocess.DEVNULL)
-
-
-def processor() -> str:
-    """What the machine calls its processor."""
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text().splitlines() if information.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def train(method: str, scene: Path, seconds: float, seed: int, folder: Path) -> dict[str, Any]:
@@ -85,7 +77,7 @@ def main() -> None:
                 print(records[-1], flush=True)
     content = {
         "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores of {processor()}",
+        "machine": machine(),
         "command": shlex.join(["python", *sys.argv]),
         "records": records,
     }

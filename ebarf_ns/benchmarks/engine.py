@@ -220,13 +220,12 @@ class _Engine:
         if not find_spec("nerfstudio"):
             yield Figure("time until within 1 dB of the final PSNR", None, "s")
             return
-        soon, memory, final = [], [], []
+        soon, memory = [], []
         seconds = 3.0 if self.quick else self.seconds
         for seed in self.seeds[:1] if self.quick else self.seeds:
             with tempfile.TemporaryDirectory() as folder:
                 records = _train(_demo_scene(Path(folder), seed, self.quick), Path(folder), seed, seconds)
             last = records[-1]
-            final.append(last["psnr"])
             soon.append(next(one["train_seconds"] for one in records if one["psnr"] >= last["psnr"] - 1))
             memory.append(last["peak_memory_mib"] / 1024)
             yield Figure(f"demo scene, seed {seed}, {seconds:g} s: PSNR", last["psnr"], "dB")

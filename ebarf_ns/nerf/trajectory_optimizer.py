@@ -65,8 +65,12 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.start_position: Tensor
         self.start_quat_wxyz: Tensor
         knots = _every(config.keyframe_stride or 1, len(keyframes.t_us))
-        self.register_buffer("knot_t_us", keyframes.t_us[knots].clone(), persistent=False)
-        self.knot_t_us: Tensor
+        # Between which knots each keyframe lies never changes.
+        left, fraction = intervals(keyframes.t_us[knots], keyframes.t_us)
+        self.register_buffer("left_knot", left, persistent=False)
+        self.register_buffer("way_to_next_knot", fraction[:, None], persistent=False)
+        self.left_knot: Tensor
+        self.way_to_next_knot: Tensor
         if config.mode == "refine":
             self.correction = nn.Parameter(torch.zeros(len(knots), 6))
 
@@ -80,9 +84,9 @@ class TrajectoryOptimizer(CameraOptimizer):
         if self.config.mode == "off":
             return start
         correction = self.correction
-        if len(self.knot_t_us) < len(self.keyframe_t_us):
-            left, fraction = intervals(self.knot_t_us, self.keyframe_t_us)
-            correction = torch.lerp(correction[left], correction[left + 1], fraction.to(correction)[:, None])
+        if len(correction) < len(self.keyframe_t_us):
+            left, right = correction[self.left_knot], correction[self.left_knot + 1]
+            correction = torch.lerp(left, right, self.way_to_next_knot.to(correction))
         return corrected(start, self.pixel_rad * correction)
 
     def trajectory(self) -> Trajectory:
