@@ -39,6 +39,8 @@ class Frame:
     event_camera_from_frame_camera: tuple[tuple[float, ...], ...]
     """4x4; identity where the event sensor itself took the frame."""
     intensity: FrameIntensity
+    depth: Path | None = None
+    """Distances along the pixels' rays in the reference's unit (npy), where somebody knows them."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,8 @@ def _frame_json(frame: Frame, scene: Scene) -> dict[str, Any]:
         "t_us": frame.t_us,
         "intensity": frame.intensity,
     }
+    if frame.depth:
+        content["depth"] = _relative(frame.depth, scene.folder)
     if frame.camera != scene.camera:
         content["camera"] = _camera_json(frame.camera)
     if not np.array_equal(frame.event_camera_from_frame_camera, np.eye(4)):
@@ -280,7 +284,7 @@ def _read_frames(path: Path, event_camera: Camera) -> tuple[Frame, ...]:
 
 
 def _frame(content: _Object, event_camera: Camera) -> Frame:
-    content.only("file t_us camera event_camera_from_frame_camera intensity".split())
+    content.only("file t_us camera event_camera_from_frame_camera intensity depth".split())
     extrinsic = content.get("event_camera_from_frame_camera")
     if extrinsic is not None:
         rows = isinstance(extrinsic, list) and len(extrinsic) == 4 and all(isinstance(row, list) for row in extrinsic)
@@ -292,4 +296,5 @@ def _frame(content: _Object, event_camera: Camera) -> Frame:
         camera=_camera(content.object("camera")) if content.get("camera") is not None else event_camera,
         event_camera_from_frame_camera=tuple(tuple(map(float, row)) for row in extrinsic or np.eye(4).tolist()),
         intensity=content.choice("intensity", get_args(FrameIntensity)),
+        depth=content.optional_file("depth"),
     )

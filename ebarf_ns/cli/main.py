@@ -14,6 +14,7 @@ from ebarf_ns.benchmarks.settings import EngineBenchmark
 from ebarf_ns.errors import EbarfError, one_line_errors
 from ebarf_ns.process import Bounds
 from ebarf_ns.simulation.simulate import Simulation
+from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
 
 
 @dataclass
@@ -101,24 +102,19 @@ class TrajectoryCompare:
 
 @dataclass
 class TrajectoryPerturb:
-    """Add white noise to every pose of a TUM file, in its own frame: an imperfect trajectory for experiments."""
+    """Give a TUM file errors as odometry makes them: an imperfect trajectory for experiments."""
 
     source: tyro.conf.Positional[Path]
     output: tyro.conf.Positional[Path]
-    position: float = 0.03
-    """Standard deviation per axis, in the trajectory's unit."""
-    rotation_deg: float = 1.72
-    """Standard deviation per axis."""
+    errors: tyro.conf.OmitArgPrefixes[TrajectoryErrors] = field(default_factory=TrajectoryErrors)
+    """What is wrong with it, in the trajectory's own unit."""
     seed: int = 0
 
     def run(self) -> None:
         """Write the perturbed trajectory."""
-        from math import radians
-
         from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
-        from ebarf_ns.simulation.motion import perturb
 
-        perturbed = perturb(read_tum(self.source), self.position, radians(self.rotation_deg), self.seed)
+        perturbed = perturb(read_tum(self.source), self.errors, self.seed)
         write_tum(self.output, perturbed)
         _stderr.print(f"{len(perturbed.t_us)} perturbed poses in {self.output}")
 

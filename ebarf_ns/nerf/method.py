@@ -77,7 +77,7 @@ ebarf = MethodSpecification(
         EbarfModelConfig(),
         field_rate=1e-2,
         pose_rate_px=0.1,
-        restart_field_at=0.3,
+        restart_field_at=0.07,
     ),
     description="NeRF from an event camera and its imperfect trajectory, which is refined on the way.",
 )

@@ -111,7 +111,7 @@ class EbarfTrainerConfig(TrainerConfig):
     """End after this many seconds of training, evaluation and loading excluded; all schedules follow."""
     evaluations: int = 8
     """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
-    restart_field_at: float | None = 0.3
+    restart_field_at: float | None = 0.07
     """Fraction of the budget after which the field starts again with the poses refined so far; None: never."""
 
 

@@ -1,14 +1,26 @@
-"""Smooth camera motion with six degrees of freedom, exact at every microsecond."""
+"""Smooth camera motions with six degrees of freedom, exact at every instant."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.geometry.so3 import quat_wxyz_exp
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
+
+
+class Motion(Protocol):
+    """Where a camera is at any time, in metres and microseconds."""
+
+    def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """Camera centres [m]."""
+        ...
+
+    def rotation(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
+        """Camera-to-world rotations, OpenCV axes."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -23,42 +35,86 @@ class HandheldMotion:
     seed: int = 0
     tones: int = 3
 
-    def position(self, t_us: Int64[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+    def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
         """Camera centres [m]."""
-        return np.asarray(self.place) + np.asarray(self.sway_m) * self._tones(t_us, 0)
+        return np.asarray(self.place) + np.asarray(self.sway_m) * self._sway(t_us, 0)
 
-    def rotation(self, t_us: Int64[np.ndarray, "times"]) -> Rotation:
+    def rotation(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
         """Camera-to-world rotations, OpenCV axes."""
-        turn = Rotation.from_rotvec(self.turn_rad * self._tones(t_us, 3))
-        return _looking(np.asarray(self.look_at) - np.asarray(self.place)) * turn
+        turn = Rotation.from_rotvec(self.turn_rad * self._sway(t_us, 3)).as_matrix()
+        return _looking(np.asarray(self.look_at) - np.asarray(self.place)) @ turn
 
-    def _tones(self, t_us: np.ndarray, first_axis: int) -> np.ndarray:
-        random = np.random.default_rng([self.seed, first_axis])
-        frequency = random.uniform(*self.frequency_hz, (self.tones, 3))
-        phase = random.uniform(0, 2 * np.pi, (self.tones, 3))
-        angle = 2 * np.pi * frequency * (np.asarray(t_us) * 1e-6)[:, None, None] + phase
-        return np.sin(angle).sum(axis=1) / np.sqrt(self.tones)
+    def _sway(self, t_us: np.ndarray, first_axis: int) -> np.ndarray:
+        return _sway(t_us, self.seed, first_axis, self.frequency_hz, self.tones)
 
 
-def _looking(forward: np.ndarray) -> Rotation:
-    """The level camera (x right, y down, world z up) that looks along ``forward``."""
-    forward = forward / np.linalg.norm(forward)
+@dataclass(frozen=True)
+class OrbitMotion:
+    """A camera carried around a centre that it keeps in view, with some sway of the hand that carries it."""
+
+    centre: tuple[float, float, float] = (0.0, 0.0, -0.5)
+    radius_m: float = 1.5
+    height_m: float = 0.8
+    """Above the centre."""
+    rate_rad_s: float = 0.8
+    sway_m: float = 0.06
+    turn_rad: float = 0.05
+    seed: int = 0
+
+    def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """Camera centres [m]."""
+        return self._carried(t_us) + self.sway_m * _sway(t_us, self.seed, 0)
+
+    def rotation(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
+        """Camera-to-world rotations, OpenCV axes."""
+        turn = Rotation.from_rotvec(self.turn_rad * _sway(t_us, self.seed, 3)).as_matrix()
+        return _looking(np.asarray(self.centre) - self._carried(t_us)) @ turn
+
+    def _carried(self, t_us: np.ndarray) -> np.ndarray:
+        start_rad = np.random.default_rng([self.seed, 6]).uniform(0, 2 * np.pi)
+        angle_rad = start_rad + self.rate_rad_s * np.asarray(t_us) * 1e-6
+        level = self.radius_m * np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)
+        return np.asarray(self.centre) + np.insert(level, 2, self.height_m, axis=-1)
+
+
+@dataclass(frozen=True)
+class Faster:
+    """Another motion, played at another speed."""
+
+    motion: Motion
+    speed: float
+
+    def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """Camera centres [m]."""
+        return self.motion.position(np.asarray(t_us) * self.speed)
+
+    def rotation(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
+        """Camera-to-world rotations, OpenCV axes."""
+        return self.motion.rotation(np.asarray(t_us) * self.speed)
+
+
+def _sway(
+    t_us: np.ndarray, seed: int, first_axis: int, frequency_hz: tuple[float, float] = (0.2, 0.7), tones: int = 3
+) -> np.ndarray:
+    """Three numbers of about unit variance that wander smoothly with time."""
+    random = np.random.default_rng([seed, first_axis])
+    frequency = random.uniform(*frequency_hz, (tones, 3))
+    phase = random.uniform(0, 2 * np.pi, (tones, 3))
+    angle = 2 * np.pi * frequency * (np.asarray(t_us) * 1e-6)[:, None, None] + phase
+    return np.sin(angle).sum(axis=1) / np.sqrt(tones)
+
+
+def _looking(forward: np.ndarray) -> np.ndarray:
+    """Level cameras (x right, y down, world z up) that look along ``forward``, one direction or many."""
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward], axis=1))
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=-1)
 
 
-def sample_trajectory(motion: HandheldMotion, t_us: Int64[np.ndarray, "times"]) -> Trajectory:
+def sample_trajectory(motion: Motion, t_us: Int64[np.ndarray, "times"]) -> Trajectory:
     """The true poses at given times, float64."""
-    quat_xyzw = torch.from_numpy(motion.rotation(t_us).as_quat())
+    quat_xyzw = torch.from_numpy(Rotation.from_matrix(motion.rotation(t_us)).as_quat())
     return Trajectory(
         torch.from_numpy(t_us), Poses(torch.from_numpy(motion.position(t_us)), quat_xyzw[:, [3, 0, 1, 2]])
     )
-
-
-def perturb(trajectory: Trajectory, position_noise: float, rotation_noise_rad: float, seed: int) -> Trajectory:
-    """Each keyframe moved by white noise of the given standard deviations per axis, in its own frame (the paper's)."""
-    random = np.random.default_rng([seed, 99])
-    noise = torch.from_numpy(random.standard_normal((len(trajectory.t_us), 6)))
-    turn = quat_wxyz_exp(rotation_noise_rad * noise[:, :3])
-    return Trajectory(trajectory.t_us, trajectory.poses.compose(Poses(position_noise * noise[:, 3:], turn)))

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit, prange
 
+_TINY = 1e-200
+
 
 @dataclass(frozen=True)
 class Room:
@@ -29,72 +31,74 @@ class Room:
     """Coarsest detail of the pattern; the finest is a quarter of it."""
     log_contrast: float = 1.1
     """Amplitude of the pattern in log radiance."""
+    face_contrast: float = 0.35
+    """Largest difference in log radiance of a whole face from the mean, so that edges show everywhere."""
+    window: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Lowest y and z, then highest, of a window in the wall of highest x; nothing where it has no area."""
+    daylight: float = 1000.0
+    """How many times brighter than indoors it is behind the window."""
     seed: int = 0
 
     def cast(
-        self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "rays 3"]
+        self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]
     ) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
-        """Radiance (about 0.05 to 1.5) and distance [m] along unit directions from one point."""
+        """Radiance (indoors about 0.05 to 1.5) and distance [m] along unit directions."""
         walls = np.array([*self.lower, *self.upper])
         boxes = np.array(self.boxes, float).reshape(-1, 6)
         balls = np.array(self.balls, float).reshape(-1, 4)
-        return _cast(origin, direction, walls, boxes, balls, self.wavelength, self.log_contrast, self.seed)
+        window = np.array([*self.window, np.log(self.daylight)])
+        look = (self.wavelength, self.log_contrast, self.face_contrast, self.seed)
+        return _cast(origin, direction, walls, boxes, balls, window, *look)
 
 
 @njit(cache=True, parallel=True)
-def _cast(origin, direction, walls, boxes, balls, wavelength, log_contrast, seed):
+def _cast(origin, direction, walls, boxes, balls, window, wavelength, log_contrast, face_contrast, seed):
     count = len(direction)
     radiance = np.empty(count)
     distance = np.empty(count)
     for i in prange(count):
-        d = direction[i]
-        nearest, normal_axis, surface = _leave_box(origin, d, walls)
+        o, d = origin[i], direction[i]
+        # Divided once; of a ray along a face, by what is as good as nothing.
+        slow = (1 / (d[0] or _TINY), 1 / (d[1] or _TINY), 1 / (d[2] or _TINY))
+        nearest, normal_axis, surface = _leave_box(o, slow, walls)
         for b in range(len(boxes)):
-            t, axis = _enter_box(origin, d, boxes[b])
+            t, axis = _enter_box(o, slow, boxes[b])
             if t < nearest:
                 nearest, normal_axis, surface = t, axis, 10 + b
         for b in range(len(balls)):
-            t = _enter_ball(origin, d, balls[b])
+            t = _enter_ball(o, d, balls[b])
             if t < nearest:
                 nearest, normal_axis, surface = t, 3, 100 + b
-        x = origin[0] + nearest * d[0]
-        y = origin[1] + nearest * d[1]
-        z = origin[2] + nearest * d[2]
-        pattern = _pattern(x, y, z, normal_axis, surface + 1000 * seed, wavelength)
-        # Each face has its own shade, so that edges show everywhere.
-        shade = 0.35 * _hash(surface, normal_axis, 7, seed)
-        radiance[i] = 0.3 * np.exp(log_contrast * pattern + shade)
+        x = o[0] + nearest * d[0]
+        y = o[1] + nearest * d[1]
+        z = o[2] + nearest * d[2]
+        log_radiance = log_contrast * _pattern(x, y, z, normal_axis, surface + 1000 * seed, wavelength)
+        log_radiance += face_contrast * _hash(surface, normal_axis, 7, seed)
+        if surface == 1 and window[0] < y < window[2] and window[1] < z < window[3]:
+            log_radiance += window[4]
+        radiance[i] = 0.3 * np.exp(log_radiance)
         distance[i] = nearest
     return radiance, distance
 
 
 @njit(cache=True)
-def _leave_box(origin, d, box):
+def _leave_box(origin, slowness, box):
     nearest, normal_axis, surface = np.inf, 0, 0
     for axis in range(3):
-        if d[axis] > 0:
-            t = (box[3 + axis] - origin[axis]) / d[axis]
-        elif d[axis] < 0:
-            t = (box[axis] - origin[axis]) / d[axis]
-        else:
-            continue
+        forwards = slowness[axis] > 0
+        t = ((box[3 + axis] if forwards else box[axis]) - origin[axis]) * slowness[axis]
         if t < nearest:
-            nearest, normal_axis, surface = t, axis, 2 * axis + (1 if d[axis] > 0 else 0)
+            nearest, normal_axis, surface = t, axis, 2 * axis + (1 if forwards else 0)
     return nearest, normal_axis, surface
 
 
 @njit(cache=True)
-def _enter_box(origin, d, box):
+def _enter_box(origin, slowness, box):
     near, far, normal_axis = 0.0, np.inf, 0
     for axis in range(3):
-        if d[axis] == 0:
-            if origin[axis] < box[axis] or origin[axis] > box[3 + axis]:
-                return np.inf, 0
-            continue
-        t0 = (box[axis] - origin[axis]) / d[axis]
-        t1 = (box[3 + axis] - origin[axis]) / d[axis]
-        if t0 > t1:
-            t0, t1 = t1, t0
+        t0 = (box[axis] - origin[axis]) * slowness[axis]
+        t1 = (box[3 + axis] - origin[axis]) * slowness[axis]
+        t0, t1 = min(t0, t1), max(t0, t1)
         if t0 > near:
             near, normal_axis = t0, axis
         far = min(far, t1)
@@ -129,7 +133,8 @@ def _pattern(x, y, z, normal_axis, seed, wavelength):
     for octave in range(3):
         scale = 2.0**octave / wavelength
         value += 0.7**octave * _value_noise(x * scale, y * scale, z * scale, seed + 31 * octave)
-    return np.tanh(1.6 * value)
+    # tanh(1.6 value)
+    return 1 - 2 / (np.exp(3.2 * value) + 1)
 
 
 @njit(cache=True)
@@ -139,10 +144,14 @@ def _value_noise(x, y, z, seed):
     fx, fy, fz = _fade(x - cx), _fade(y - cy), _fade(z - cz)
     ix, iy, iz = int(cx), int(cy), int(cz)
     value = 0.0
-    for corner in range(8):
-        dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (fx if dx else 1 - fx) * (fy if dy else 1 - fy) * (fz if dz else 1 - fz)
-        value += weight * _hash(ix + dx, iy + dy, iz + dz, seed)
+    # A coordinate on the lattice, as a face has one, needs no second corner.
+    for dx in range(2 if fx > 0 else 1):
+        wx = fx if dx else 1 - fx
+        for dy in range(2 if fy > 0 else 1):
+            wxy = wx * (fy if dy else 1 - fy)
+            value += wxy * (1 - fz) * _hash(ix + dx, iy + dy, iz, seed)
+            if fz > 0:
+                value += wxy * fz * _hash(ix + dx, iy + dy, iz + 1, seed)
     return value
 
 
