@@ -33,6 +33,10 @@ class SimulationError(EbarfError):
     """The simulation was asked for something that it cannot make."""
 
 
+class BenchmarkError(EbarfError):
+    """A benchmark was asked for something that cannot be measured."""
+
+
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """Turn an :class:`EbarfError` into one line on standard error and exit code 2, without a traceback."""

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-Part = Literal["hash_grid", "step", "scaling", "frame", "index", "nerfacto", "training"]
+# Those that fill the memory come last.
+Part = Literal["hash_grid", "step", "nerfacto", "frame", "training", "scaling", "index"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 

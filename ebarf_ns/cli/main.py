@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark
 from ebarf_ns.errors import EbarfError, one_line_errors
@@ -130,6 +130,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Print the last evaluation and where the report is."""
+        from ebarf_ns.evaluation.frames import lpips_missing
         from ebarf_ns.evaluation.report import read_metrics, write_report
         from ebarf_ns.scene import read_scene
 
@@ -140,6 +141,8 @@ class Evaluate:
             _stderr.print(f"the run's scene is gone, so the report has no reference trajectory ({error})")
             groundtruth = None
         page = write_report(self.run_folder, groundtruth)
+        if "psnr" in evaluations[-1] and evaluations[-1].get("lpips") is None and (missing := lpips_missing()):
+            _stderr.print(missing, soft_wrap=True)
         if self.json:
             _print_json({**evaluations[-1], "method": header.get("method"), "report": str(page)})
         else:
@@ -163,27 +166,54 @@ class Trajectory:
 
 @dataclass
 class Bench:
-    """Measure the project itself; engine is its speed beside nerfstudio's and how its cost grows, in half an hour."""
+    """Measure: engine is our speed beside nerfstudio's; a manifest is a comparison of methods, error against run time.
 
-    what: tyro.conf.Positional[Literal["engine"]]
-    settings: tyro.conf.OmitArgPrefixes[EngineBenchmark] = field(default_factory=EngineBenchmark)
-    """What to measure."""
+    A comparison can be stopped, and goes on where it stopped.
+    """
+
+    what: tyro.conf.Positional[str]
+    """engine, or a manifest such as configs/benchmarks/shipped.yaml."""
+    engine: tyro.conf.OmitArgPrefixes[EngineBenchmark] = field(default_factory=EngineBenchmark)
+    """What to measure of the engine."""
     output: Path | None = None
-    """Keep the figures in this JSON file."""
+    """Of the engine: a JSON file for its figures. Of a comparison: the folder for scenes, runs, records and diagrams;
+    where not given, bench/ and the manifest's name."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Measure, print, and keep."""
-        from ebarf_ns.benchmarks.engine import run_engine_benchmark, table, write
-
-        result = run_engine_benchmark(self.settings, _stderr.print)
-        if self.output:
-            write(result, self.output)
+        result, shown = self._engine() if self.what == "engine" else self._comparison()
         if self.json:
             _print_json(result)
         else:
-            sys.stdout.write(table(result) + "\n")
+            sys.stdout.write(shown + "\n")
+
+    def _engine(self) -> tuple[dict[str, Any], str]:
+        from ebarf_ns.benchmarks.engine import run_engine_benchmark, table, write
+
+        result = run_engine_benchmark(self.engine, _stderr.print)
+        if self.output:
+            write(result, self.output)
+        return result, table(result)
+
+    def _comparison(self) -> tuple[dict[str, Any], str]:
+        from ebarf_ns.benchmarks.comparison import run_comparison
+        from ebarf_ns.benchmarks.manifest import read_manifest
+        from ebarf_ns.evaluation.diagrams import tables, write_diagrams
+
+        manifest = read_manifest(Path(self.what))
+        folder = self.output or Path("bench") / manifest.name
+        with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=_stderr) as progress:
+            task = progress.add_task("", total=None)
+            result = run_comparison(
+                manifest,
+                folder,
+                lambda done, of, what: progress.update(task, completed=done, total=of, description=what),
+            )
+        for path in write_diagrams(result, folder):
+            _stderr.print(f"written: {path}", soft_wrap=True)
+        return result, tables(result)
 
 
 _stderr = Console(stderr=True)

@@ -1,6 +1,7 @@
-"""Validation frames as linear radiance, and how well renders match them."""
+"""Validation frames as linear radiance and depth, and how well renders match them."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,11 +13,12 @@ from ebarf_ns.errors import EvaluationError
 from ebarf_ns.scene import Frame
 
 _DARKEST = 1e-3
+_SMALLEST_FOR_LPIPS = 64
 
 
 def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
     """Linear radiance of a frame, 0 to 1 for integer formats; raises :class:`EvaluationError`."""
-    pixels = _read_pixels(frame.path)
+    pixels = read_pixels(frame.path)
     if pixels.shape != (frame.camera.height, frame.camera.width):
         raise EvaluationError(
             f"{frame.path}: {pixels.shape[1]}x{pixels.shape[0]} pixels, expected the camera's "
@@ -29,7 +31,8 @@ def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
     return pixels
 
 
-def _read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
+def read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
+    """Grey as the file has it, 0 to 1 for integer formats; raises :class:`EvaluationError`."""
     # OpenCV reads EXR only when asked to; it looks here at its first image.
     os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
     try:
@@ -44,17 +47,39 @@ def _read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
     return grey.astype(np.float64) / scale
 
 
+def read_depth(frame: Frame) -> Float[np.ndarray, "height width"] | None:
+    """Distances along the pixels' rays in the reference's unit, where known; raises :class:`EvaluationError`."""
+    if frame.depth is None:
+        return None
+    try:
+        depth = np.load(frame.depth, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise EvaluationError(f"{frame.depth}: cannot be read as an array ({str(error).splitlines()[0]:.80})") from None
+    expected = (frame.camera.height, frame.camera.width)
+    if depth.shape != expected or depth.dtype.kind != "f":
+        raise EvaluationError(f"{frame.depth}: {depth.dtype} of shape {depth.shape}, expected floats of {expected}")
+    return depth.astype(np.float64)
+
+
+def depth_error(
+    rendered: Float[np.ndarray, "height width"], reference: Float[np.ndarray, "height width"]
+) -> float | None:
+    """Mean of |rendered - true| / true over the pixels whose true depth is known (the field's AbsRel)."""
+    known = np.isfinite(reference) & (reference > 0)
+    return float(np.mean(np.abs(rendered - reference)[known] / reference[known])) if known.any() else None
+
+
 def fit_brightness(
     rendered_log: list[Float[np.ndarray, "height width"]], reference: list[Float[np.ndarray, "height width"]]
 ) -> list[Float[np.ndarray, "height width"]]:
     """Renders as linear radiance after one affine fit in log brightness over the whole set.
 
     Events leave gain and offset of log brightness open: log reference ~ a * rendered_log + b, least squares over the
-    pixels where the reference is not black.
+    pixels where the reference is neither black nor, at 1, as white as its format can say.
     """
     x = np.concatenate([image.ravel() for image in rendered_log])
     y = np.concatenate([image.ravel() for image in reference])
-    bright = y > _DARKEST
+    bright = (y > _DARKEST) & (y != 1)
     if not bright.any() or np.ptp(x[bright]) == 0:
         gain, offset = 0.0, float(np.log(np.maximum(y, _DARKEST)).mean())
     else:
@@ -65,15 +90,38 @@ def fit_brightness(
 def image_errors(
     rendered_log: list[Float[np.ndarray, "height width"]], reference: list[Float[np.ndarray, "height width"]]
 ) -> dict[str, float]:
-    """Mean PSNR and SSIM of log-brightness renders against linear references, on [0, 1] after the joint fit."""
-    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+    """Mean PSNR, SSIM and LPIPS of log-brightness renders against linear references, on [0, 1] after the joint fit.
+
+    LPIPS (Zhang et al. 2018, AlexNet) is not among them where :func:`lpips_missing` says why.
+    """
+    from torchmetrics.functional.image import (
+        learned_perceptual_image_patch_similarity,
+        peak_signal_noise_ratio,
+        structural_similarity_index_measure,
+    )
 
     white = max(float(image.max()) for image in reference)
-    psnr, ssim = [], []
+    errors: dict[str, list[float]] = {"psnr": [], "ssim": [], "lpips": []}
+    with_lpips = lpips_missing(reference) is None
     for fitted, truth in zip(fit_brightness(rendered_log, reference), reference, strict=True):
         ours, theirs = (torch.from_numpy(np.clip(image / white, 0, 1))[None, None].float() for image in (fitted, truth))
-        psnr.append(float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)))
+        errors["psnr"].append(float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)))
         similarity = structural_similarity_index_measure(ours, theirs, data_range=1.0)
         assert isinstance(similarity, torch.Tensor)
-        ssim.append(float(similarity))
-    return {"psnr": float(np.mean(psnr)), "ssim": float(np.mean(ssim))}
+        errors["ssim"].append(float(similarity))
+        if with_lpips:
+            ours, theirs = (image.expand(-1, 3, -1, -1) for image in (ours, theirs))
+            distance = learned_perceptual_image_patch_similarity(ours, theirs, net_type="alex", normalize=True)
+            errors["lpips"].append(float(distance))
+    return {name: float(np.mean(values)) for name, values in errors.items() if values}
+
+
+def lpips_missing(reference: Sequence[Float[np.ndarray, "height width"]] = ()) -> str | None:
+    """Why LPIPS cannot be had, in a sentence; None where it can. Nothing is fetched from anywhere."""
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / "alexnet-owt-7be5be79.pth"
+    if not weights.is_file():
+        fetch = "import torchvision; torchvision.models.alexnet(weights='DEFAULT')"
+        return f'LPIPS left out: AlexNet\'s weights are not at {weights}; python -c "{fetch}" fetches them'
+    if any(min(image.shape) < _SMALLEST_FOR_LPIPS for image in reference):
+        return f"LPIPS left out: frames are smaller than {_SMALLEST_FOR_LPIPS} pixels"
+    return None

@@ -20,3 +20,20 @@ def unexplained_share(
     shared = float((weight * change * reported).sum())
     # A render that moves against the events explains nothing of them.
     return 1 - max(shared, 0.0) ** 2 / (energy * total) if energy > 0 else 1.0
+
+
+def implied_thresholds(
+    change: Float[np.ndarray, "pairs"],
+    polarity_sum: Float[np.ndarray, "pairs"],
+    event_count: Float[np.ndarray, "pairs"],
+) -> tuple[float | None, float | None]:
+    """The contrast thresholds, on and off, in log brightness, by which the events say what the render shows.
+
+    Least squares of change ~ on * (brighter events) - off * (darker events), each pair weighted by one over its
+    events. None for both where the pairs cannot tell them apart.
+    """
+    weight = 1 / np.sqrt(event_count)
+    brighter = (event_count + polarity_sum) / 2
+    counts = np.stack([brighter, brighter - event_count], axis=1) * weight[:, None]
+    (on, off), _, rank, _ = np.linalg.lstsq(counts, change * weight, rcond=1e-6)
+    return (float(on), float(off)) if rank == 2 else (None, None)

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from ebarf_ns.errors import EvaluationError
+from ebarf_ns.evaluation.frames import lpips_missing
 from ebarf_ns.evaluation.trajectory_error import aligned_positions
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum
@@ -99,6 +100,7 @@ def _curves_figure(evaluations: list[dict[str, Any]]) -> Figure:
 
 
 def _page(header: dict[str, Any], evaluations: list[dict[str, Any]], report: Path, renders: list[Path]) -> str:
+    missing = lpips_missing() if "psnr" in evaluations[-1] and evaluations[-1].get("lpips") is None else None
     columns = [key for key in evaluations[-1] if any(record.get(key) is not None for record in evaluations)]
     rows = "".join(
         "<tr>" + "".join(f"<td>{_cell(record.get(key))}</td>" for key in columns) + "</tr>" for record in evaluations
@@ -121,6 +123,7 @@ img{{width:24rem;image-rendering:pixelated}}</style>
 <h1>{html.escape(str(header.get("method", "run")))}</h1><p>{facts}</p>
 <h2>Trajectory</h2><p>Aligned to the reference where there is one (by orientation and scale).</p>{svgs}
 <h2>Evaluations</h2><table><tr>{"".join(f"<th>{html.escape(key)}</th>" for key in columns)}</tr>{rows}</table>
+<p>{html.escape(missing or "")}</p>
 <h2>Views at the refined poses</h2>{pictures or "<p>The scene has no frames to compare with.</p>"}
 <h2>Plan</h2><table>{plan}</table>
 """

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
+_MOST_OVER_MEAN = 20
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class PairIndex:
     busiest: Int64[np.ndarray, "pixels"]
     """Pixels, those with the most events first."""
     events_before: Int64[np.ndarray, "pixels+1"]
-    """Number of events of all the pixels before each place of ``busiest``."""
+    """Number of events of all the pixels before each place of ``busiest``; of one pixel, no more count than 20 times
+    what a pixel usually has, lest a hot pixel's millions fill the batches."""
 
     @property
     def max_steps(self) -> int:
@@ -126,7 +128,13 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events):
             else:
                 high = middle - 1
         pixel[i] = busiest[low]
-        last = first[pixel[i]] + steps[i] + number[i] - (events_before[low] - steps[i] * low)
+        pair = number[i] - (events_before[low] - steps[i] * low)
+        there_are = first[pixel[i] + 1] - first[pixel[i]]
+        counted = events_before[low + 1] - events_before[low]
+        if there_are > counted:
+            # Too busy a pixel: as many of its pairs as count, spread over all of them.
+            pair = pair * (there_are - steps[i]) // (counted - steps[i])
+        last = first[pixel[i]] + steps[i] + pair
         before, after = events[last - steps[i]], events[last]
         t0_us[i], t1_us[i] = before.t_us, after.t_us
         total[i] = np.int64(after.running_polarity) - before.running_polarity
@@ -162,7 +170,10 @@ def index_pairs(
             _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
         begin = end
     busiest = np.argsort(-counts, kind="stable")
-    return PairIndex(events, first, busiest, np.r_[0, counts[busiest].cumsum()])
+    # Hot pixels are few; they do not say what is usual.
+    usual = counts[busiest[len(busiest) // 100 + 1 :]]
+    most = max(2, _MOST_OVER_MEAN * int(usual.sum()) // np.count_nonzero(usual)) if usual.any() else total
+    return PairIndex(events, first, busiest, np.r_[0, np.minimum(counts, most)[busiest].cumsum()])
 
 
 def _file_backed(count: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.
 def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float, dict[str, int]]:
     """Of the registered method, through the trainer, on a scene; and nerfacto's names for the grid planned for it.
 
-    The first half of the steps warms up; of the others the mean counts, because every eighth does more.
+    The first half of the steps warms up; of the others the median of eight at a time counts: every eighth does more.
     """
     from ebarf_ns.nerf.method import ebarf
     from ebarf_ns.nerf.trainer import EbarfTrainerConfig
@@ -54,7 +54,7 @@ def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float,
         started = _now()
         trainer.train_iteration(step)
         times.append(_now() - started)
-    seconds = sum(times[steps // 2 :]) / (steps - steps // 2)
+    seconds = median(sum(times[k : k + 8]) / len(times[k : k + 8]) for k in range(steps // 2, steps, 8))
     model = trainer.pipeline.model.config
     shape = {
         "num_levels": model.grid_levels,

@@ -13,8 +13,8 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError, one_line_errors
-from ebarf_ns.evaluation.frames import fit_brightness, image_errors, read_frame
-from ebarf_ns.evaluation.heldout import unexplained_share
+from ebarf_ns.evaluation.frames import depth_error, fit_brightness, image_errors, read_depth, read_frame
+from ebarf_ns.evaluation.heldout import implied_thresholds, unexplained_share
 from ebarf_ns.evaluation.trajectory_error import (
     Alignment,
     reference_in_estimates_world,
@@ -66,6 +66,7 @@ class EbarfPipeline(VanillaPipeline):
         """Read what evaluation will need, so that a mistake in it does not end a run halfway."""
         for frame in self.scene.frames:
             read_frame(frame)
+            read_depth(frame)
         if self.scene.groundtruth:
             read_tum(self.scene.groundtruth)
 
@@ -92,29 +93,35 @@ class EbarfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def evaluate(self, renders: Path | None = None) -> dict[str, Any]:
-        """Held-out event loss and, where the scene has references, image and trajectory errors.
+        """Held-out event loss and, where the scene has references, image, depth and trajectory errors.
 
         With ``renders``, each frame is written there beside its reference as a PNG.
         """
         self.eval()
-        results: dict[str, Any] = {"heldout_event_loss": self._heldout_event_loss()}
-        results |= self._image_errors(renders)
-        results |= self._trajectory_errors()
+        trajectory_errors, scale = self._trajectory_errors()
+        results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors}
         self.train()
         return results
 
-    def _heldout_event_loss(self) -> float | None:
+    def _heldout(self) -> dict[str, float | None]:
+        """How well held-out events are predicted, and the contrast thresholds by which they would be best."""
         if not self.scene.events.is_file() or not len(self.datamanager.heldout_pairs):
-            return None
+            return {"heldout_event_loss": None}
         rays, batch = self.datamanager.next_eval(0)
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)
         polarity_sum, event_count = batch["polarity_sum"].cpu(), batch["event_count"].cpu()
         threshold = self.scene.contrast_threshold
         on, off = (threshold.on, threshold.off) if threshold else (1.0, 1.0)
         reported = reported_change(polarity_sum, event_count, on, off).double()
-        return unexplained_share((after - before).numpy(), reported.numpy(), event_count.double().numpy())
+        change, counts = (after - before).numpy(), event_count.double().numpy()
+        implied = implied_thresholds(change, polarity_sum.double().numpy(), counts)
+        return {
+            "heldout_event_loss": unexplained_share(change, reported.numpy(), counts),
+            "implied_threshold_on": implied[0],
+            "implied_threshold_off": implied[1],
+        }
 
-    def _image_errors(self, renders: Path | None) -> dict[str, float]:
+    def _image_errors(self, renders: Path | None, scale_to_reference: float | None) -> dict[str, float | None]:
         """Frames at the refined pose of their time, and apart from them those outside the trajectory's span."""
         optimizer, scale = self.model.camera_optimizer, self._normalization.scale
         keyframe_t_us = optimizer.keyframe_t_us.cpu()
@@ -122,18 +129,20 @@ class EbarfPipeline(VanillaPipeline):
         for frame in self.scene.frames:
             inside = keyframe_t_us[0] <= frame.t_us <= keyframe_t_us[-1]
             (within if inside else outside).append(frame)
-        results: dict[str, float] = {}
+        results: dict[str, float | None] = {}
         if within:
             t_us = torch.tensor([frame.t_us for frame in within])
             initial = Poses(*(column.cpu() for column in optimizer.initial()))
             # Placed along the initial trajectory, from where the model moves them along with the refined one.
             poses = interpolate(keyframe_t_us, initial, t_us)
-            results |= self._compare(within, frame_cameras(within, Trajectory(t_us, poses), scale), renders)
+            cameras = frame_cameras(within, Trajectory(t_us, poses), scale)
+            results |= self._compare(within, cameras, scale_to_reference, renders)
         if outside:
             results |= {"frames_outside_span": float(len(outside))}
             cameras = self._cameras_at_reference(outside)
             if cameras is not None:
-                results |= {f"{name}_outside_span": value for name, value in self._compare(outside, cameras).items()}
+                errors = self._compare(outside, cameras, scale_to_reference)
+                results |= {f"{name}_outside_span": value for name, value in errors.items()}
         return results
 
     def _cameras_at_reference(self, frames: list[Frame]) -> Cameras | None:
@@ -153,12 +162,11 @@ class EbarfPipeline(VanillaPipeline):
         cameras.metadata = {}
         return cameras
 
-    def _compare(self, frames: list[Frame], cameras: Cameras, renders: Path | None = None) -> dict[str, float]:
-        rendered = [
-            self.model.get_outputs_for_camera(cameras[k : k + 1].to(self.device))["brightness"][..., 0].double()
-            for k in range(len(frames))
-        ]
-        rendered = [image.cpu().numpy() for image in rendered]
+    def _compare(
+        self, frames: list[Frame], cameras: Cameras, scale_to_reference: float | None, renders: Path | None = None
+    ) -> dict[str, float | None]:
+        outputs = [self.model.get_outputs_for_camera(cameras[k : k + 1].to(self.device)) for k in range(len(frames))]
+        rendered = [output["brightness"][..., 0].double().cpu().numpy() for output in outputs]
         references = [read_frame(frame) for frame in frames]
         if renders:
             white = max(float(image.max()) for image in references)
@@ -167,13 +175,27 @@ class EbarfPipeline(VanillaPipeline):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
                 with whole_file(renders / f"{k:04d}.png") as temporary:
                     cv2.imwrite(str(temporary), (beside * 255).round().astype(np.uint8))
-        return {**image_errors(rendered, references), "frames": float(len(frames))}
+        depths = []
+        unit = (scale_to_reference or 1.0) / self._normalization.scale
+        for frame, output in zip(frames, outputs, strict=True):
+            reference = read_depth(frame)
+            if reference is not None:
+                depths.append(depth_error(unit * output["depth"][..., 0].double().cpu().numpy(), reference))
+        known = [error for error in depths if error is not None]
+        return {
+            "lpips": None,
+            **image_errors(rendered, references),
+            "frames": float(len(frames)),
+            "depth_abs_rel": float(np.mean(known)) if known else None,
+        }
 
-    def _trajectory_errors(self) -> dict[str, Any]:
+    def _trajectory_errors(self) -> tuple[dict[str, Any], float | None]:
+        """Errors under each alignment, and the scale that takes the trajectory's unit to the reference's."""
         if self.scene.groundtruth is None:
-            return {}
+            return {}, None
         reference, estimate = read_tum(self.scene.groundtruth), self.trajectory()
         results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": None, "scale": None, "ape_full": None}
+        scales = {}
         for alignment, suffix in _ALIGNMENTS.items():
             try:
                 error = trajectory_error(estimate, reference, alignment)
@@ -182,11 +204,11 @@ class EbarfPipeline(VanillaPipeline):
                 results |= {f"ate_m{suffix}": None}
                 continue
             results |= {f"ate_m{suffix}": error.ate_m, "rotation_deg": error.rotation_deg}
-            if alignment == "sim3":
-                results |= {"scale": error.scale}
+            scales[alignment] = error.scale
             if alignment == "se3":
                 results |= {"ape_full": error.ape_full}
-        return results
+        results["scale"] = scales.get("sim3")
+        return results, scales.get("sim3", scales.get("orientation"))
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

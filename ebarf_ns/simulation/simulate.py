@@ -63,10 +63,15 @@ class Simulation:
     """Of the motion, the room's pattern, the sensor and the trajectory errors."""
 
 
-def simulate(settings: Simulation, folder: Path, progress: Callable[[float], None] = lambda fraction: None) -> Scene:
-    """Write a scene folder; raises :class:`SimulationError` for settings that describe no scene."""
+def simulate(
+    settings: Simulation,
+    folder: Path,
+    progress: Callable[[float], None] = lambda fraction: None,
+    place: Place | None = None,
+) -> Scene:
+    """Write a scene folder, of ``place`` where it is given; raises :class:`SimulationError` for impossible settings."""
     end_us = _check(settings)
-    place = CATALOGUE[settings.scene](settings.seed)
+    place = place or CATALOGUE[settings.scene](settings.seed)
     view = _view(place, settings)
     recording = record(view, settings.sensor, end_us, settings.seed, progress)
     if not len(recording):

@@ -1,11 +1,21 @@
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
+import torchvision
 
 from ebarf_ns.errors import EvaluationError
-from ebarf_ns.evaluation.frames import fit_brightness, image_errors, read_frame
+from ebarf_ns.evaluation.frames import (
+    depth_error,
+    fit_brightness,
+    image_errors,
+    lpips_missing,
+    read_depth,
+    read_frame,
+)
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.scene import Frame
 
@@ -72,3 +82,50 @@ def test_a_constant_grey_render_scores_badly_and_finitely():
     errors = image_errors([np.full((24, 32), 0.3)], [picture()])
     assert 5 < errors["psnr"] < 20 and errors["ssim"] < 0.5
     assert np.isfinite(fit_brightness([np.zeros((24, 32))], [np.zeros((24, 32))])[0]).all()
+
+
+def test_saturated_pixels_leave_the_fit_and_do_not_count_where_the_render_is_brighter():
+    truth = 3 * picture()
+    reference = np.minimum(truth, 1.0)
+    assert (reference == 1).mean() > 0.2
+    assert image_errors([0.5 * np.log(truth) + 1], [reference])["psnr"] > 60
+
+
+def test_depth_error_is_relative_and_over_known_pixels():
+    truth = np.array([[1.0, 2.0], [np.nan, 0.0]])
+    assert depth_error(np.array([[1.1, 1.6], [5.0, 5.0]]), truth) == pytest.approx((0.1 + 0.2) / 2)
+    assert depth_error(truth, np.full((2, 2), np.inf)) is None
+
+
+def test_depth_of_a_wrong_shape_or_kind_is_named(tmp_path: Path):
+    path = tmp_path / "depth.npy"
+    assert read_depth(frame(tmp_path / "a.png")) is None
+    with_depth = replace(frame(tmp_path / "a.png"), depth=path)
+    for content in (np.zeros((3, 4)), np.zeros((24, 32), int)):
+        np.save(path, content)
+        with pytest.raises(EvaluationError, match=r"depth.npy: .*expected floats of \(24, 32\)"):
+            read_depth(with_depth)
+    path.write_text("nothing")
+    with pytest.raises(EvaluationError, match="depth.npy: cannot be read"):
+        read_depth(with_depth)
+    np.save(path, np.full((24, 32), 2, np.float32))
+    depth = read_depth(with_depth)
+    assert depth is not None and depth.dtype == np.float64 and (depth == 2).all()
+
+
+def test_lpips_says_why_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert "lpips" not in image_errors([np.log(picture())], [picture()])
+    assert "alexnet" in str(lpips_missing()) and str(tmp_path) in str(lpips_missing())
+
+
+@pytest.mark.slow
+def test_lpips_is_computed_where_the_weights_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    torch.manual_seed(0)
+    weights = tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth"
+    weights.parent.mkdir(parents=True)
+    torch.save(torchvision.models.alexnet().state_dict(), weights)
+    large = np.kron(picture(), np.ones((4, 4)))
+    same, other = (image_errors([np.log(render)], [large])["lpips"] for render in (large, large[:, ::-1]))
+    assert same < 1e-3 < other

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ebarf_ns.evaluation.heldout import unexplained_share
+from ebarf_ns.evaluation.heldout import implied_thresholds, unexplained_share
 
 RANDOM = np.random.default_rng(0)
 REPORTED = RANDOM.choice([-0.25, 0.25, 0.5], 5000)
@@ -24,3 +24,17 @@ def test_half_right_is_in_between():
 
 def test_nothing_reported_is_no_number():
     assert np.isnan(unexplained_share(REPORTED, np.zeros(5000), COUNT))
+
+
+def test_implied_thresholds_are_those_of_the_sensor():
+    random = np.random.default_rng(0)
+    brighter, darker = random.integers(0, 6, (2, 500)).astype(float)
+    count, some = brighter + darker, brighter + darker > 0
+    change = 0.21 * brighter - 0.34 * darker + 0.01 * random.standard_normal(500)
+    on, off = implied_thresholds(change[some], (brighter - darker)[some], count[some])
+    assert on == pytest.approx(0.21, rel=0.02) and off == pytest.approx(0.34, rel=0.02)
+
+
+def test_thresholds_that_the_pairs_cannot_tell_apart_are_none():
+    assert implied_thresholds(np.ones(5), np.ones(5), np.ones(5)) == (None, None)
+    assert implied_thresholds(np.array([0.3]), np.zeros(1), np.full(1, 2.0)) == (None, None)

@@ -50,3 +50,19 @@ def test_few_keyframes_are_left_alone(count: int):
 def test_standing_still_stays_finite():
     still = Trajectory(torch.arange(10) * 1000, Poses(torch.ones(10, 3), torch.tensor([[1.0, 0, 0, 0]]).repeat(10, 1)))
     assert torch.equal(smoothed(still).poses.position, still.poses.position)
+
+
+def test_many_keyframes_are_smoothed_as_well_and_at_once():
+    true, noisy = handheld(5000, 0, 0), handheld(5000, 0.03, 0)
+    after = smoothed(noisy)
+    assert max(errors(after, true)) < 0.15 * min(errors(noisy, true))
+    position, angle = errors(smoothed(true), true)
+    assert position < 1e-4 and angle < 1e-4
+
+
+@pytest.mark.parametrize("count", [119, 121, 399, 401, 801])
+def test_more_keyframes_are_never_smoothed_worse(count: int):
+    fewer, more = (
+        [errors(smoothed(handheld(n, 0.03, seed)), handheld(n, 0, seed)) for seed in range(4)] for n in (60, count)
+    )
+    assert (np.median(more, axis=0) < np.median(fewer, axis=0)).all()

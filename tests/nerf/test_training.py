@@ -101,22 +101,6 @@ def test_equal_seeds_give_equal_runs_and_others_do_not(tiny_scene: Path, tmp_pat
     assert same(ends[0], ends[1]) and not same(ends[0], ends[2])
 
 
-def test_a_resumed_run_ends_bitwise_where_an_uninterrupted_one_does(tiny_scene: Path, tmp_path: Path):
-    whole = trainer(config(tiny_scene, tmp_path / "whole"))
-    whole.train()
-    first = trainer(config(tiny_scene, tmp_path / "first"))
-    for step in range(7):
-        first.pipeline.train()
-        first.train_iteration(step)
-    first.save_checkpoint(6)
-    made = config(tiny_scene, tmp_path / "second")
-    made.load_dir = first.checkpoint_dir
-    second = trainer(made)
-    assert second.steps_done == 7 and second.field_restarted
-    second.train()
-    assert same(state(whole), state(second))
-
-
 def test_a_used_up_budget_is_said_in_one_line(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     done = trainer(config(tiny_scene, tmp_path))
     done.train()
@@ -157,30 +141,6 @@ def test_no_budget_is_an_error(
     assert f"--{flag.replace('_', '-')} is {value}, expected more than 0" in capsys.readouterr().err
 
 
-def test_a_step_with_a_broken_gradient_changes_nothing(tiny_scene: Path, tmp_path: Path):
-    ready = trainer(config(tiny_scene, tmp_path))
-    ready.pipeline.train()
-    ready.train_iteration(0)
-    before = state(ready)
-    handle = ready.pipeline.model.camera_optimizer.correction.register_hook(lambda gradient: gradient * float("nan"))
-    grid = {name for name in before if "density_grid" in name or "display_range" in name}
-    ready.train_iteration(1)
-    after = state(ready)
-    assert all(torch.equal(before[name], after[name]) for name in before if name not in grid)
-    assert ready.optimizers.skipped == 1  # pyright: ignore[reportAttributeAccessIssue]
-    handle.remove()
-    ready.train_iteration(2)
-    assert not same(after, state(ready))
-
-
-def test_ten_broken_steps_in_a_row_end_the_run(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    ready = trainer(config(tiny_scene, tmp_path, steps=50))
-    ready.pipeline.model.camera_optimizer.correction.register_hook(lambda gradient: gradient * float("inf"))
-    with pytest.raises(SystemExit) as stopped:
-        ready.train()
-    assert stopped.value.code == 2 and "10 training steps in a row" in capsys.readouterr().err
-
-
 def test_the_newest_checkpoint_replaces_the_older_and_loads_without_pickled_code(tiny_scene: Path, tmp_path: Path):
     ready = trainer(config(tiny_scene, tmp_path))
     ready.train()
@@ -201,35 +161,6 @@ def test_pairs_share_distances_and_jitter(tiny_scene: Path, tmp_path: Path):
     assert torch.equal(before, after)
 
 
-MODEL_CHANGES = {
-    "loss": "normalized", "brightness": "lin_log", "intensity_range": "unit", "view_dependent": True, "grid_levels": 5,
-    "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
-    "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3, "density_bias": 1.0,
-    "contract": True, "precision": "bfloat16", "all_levels_from": 1.0,
-}  # fmt: skip
-POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
-DATA_CHANGES = {"train_num_rays_per_batch": 64, "longest_pair": 3, "heldout_share": 0.2, "seed": 5}
-
-
-@pytest.mark.parametrize("key", [*MODEL_CHANGES, *DATA_CHANGES, *POSE_CHANGES])
-def test_every_field_of_the_configuration_changes_the_run(tiny_scene: Path, tmp_path: Path, key: str):
-    losses = []
-    for change in (False, True):
-        made = config(tiny_scene, tmp_path, steps=3)
-        if change and key in MODEL_CHANGES:
-            setattr(made.pipeline.model, key, MODEL_CHANGES[key])
-        if change and key in DATA_CHANGES:
-            setattr(made.machine if key == "seed" else made.pipeline.datamanager, key, DATA_CHANGES[key])
-        if change and key in POSE_CHANGES:
-            setattr(made.pipeline.model.camera_optimizer, key, POSE_CHANGES[key])  # pyright: ignore[reportAttributeAccessIssue]
-        torch.manual_seed(0)
-        ready = made.setup(local_rank=0, world_size=1)
-        ready.setup()
-        ready.pipeline.train()
-        losses.append([float(ready.train_iteration(step)[0].detach()) for step in range(3)])
-    assert losses[0] != losses[1], f"{key} changed nothing"
-
-
 def test_the_fast_paths_train_as_the_torch_reference_does(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -238,7 +169,9 @@ def test_the_fast_paths_train_as_the_torch_reference_does(
 
     ends = []
     for name in ("kernels", "reference"):
-        ready = trainer(config(tiny_scene, tmp_path / name, steps=60))
+        made = config(tiny_scene, tmp_path / name, steps=60)
+        made.restart_field_at = 0.3
+        ready = trainer(made)
         if name == "reference":
             ready.pipeline.model.renderer.field.grid.carrier = "torch"
             monkeypatch.setattr(ray_sampling_numba, "importance_edges", ray_sampling.importance_edges)

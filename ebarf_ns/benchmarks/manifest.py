@@ -1,0 +1,159 @@
+"""What a comparison consists of: methods x scenes x trajectories x seeds x seconds, read from a YAML file."""
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import yaml
+
+from ebarf_ns.errors import BenchmarkError
+from ebarf_ns.simulation.sensor import SensorModel
+from ebarf_ns.simulation.simulate import Simulation
+from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors
+
+Role = Literal["method", "floor", "ceiling"]
+T = TypeVar("T")
+_NO_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
+
+
+@dataclass(frozen=True)
+class Method:
+    """Something that is trained."""
+
+    command: str
+    """What follows ns-train: a method and its flags."""
+    role: Role = "method"
+    """floor: gets the true poses, whatever the trajectory; ceiling: leaves the poses as they are given."""
+
+    @property
+    def words(self) -> list[str]:
+        """As a shell would split the command."""
+        return shlex.split(self.command)
+
+
+@dataclass(frozen=True)
+class Other:
+    """What another program made of a scene: it joins by its files."""
+
+    method: str
+    scene: str
+    trajectory: str
+    seed: int
+    seconds: float
+    refined: Path
+    """Its trajectory, a TUM file in any similarity of the world."""
+    renders: Path | None = None
+    """Its pictures of the scene's frames: files of the same names."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A comparison."""
+
+    methods: dict[str, Method]
+    scenes: dict[str, Simulation | Path]
+    """What to simulate, for each seed anew, or a scene folder with a reference trajectory."""
+    trajectories: dict[str, TrajectoryErrors | None]
+    """What is wrong with the initial trajectory; None: the scene folder's own."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    seconds: tuple[float, ...] = (60.0,)
+    """Training times."""
+    evaluations: int = 6
+    """Of each training."""
+    others: tuple[Other, ...] = ()
+    name: str = ""
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a YAML file; raises :class:`BenchmarkError` naming file, place and expectation."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BenchmarkError(f"{path}: {error.strerror or error}; expected engine or a manifest") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BenchmarkError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    reader = _Reader(path)
+    whole = reader.mapping(content, "the file")
+    return Manifest(
+        methods={key: reader.method(value, f"methods.{key}") for key, value in reader.named(whole, "methods")},
+        scenes={key: reader.scene(value, f"scenes.{key}") for key, value in reader.named(whole, "scenes")},
+        trajectories={
+            key: reader.errors(value, f"trajectories.{key}") for key, value in reader.named(whole, "trajectories")
+        },
+        seeds=tuple(map(int, reader.numbers(whole, "seeds", [0, 1, 2]))),
+        seconds=tuple(reader.numbers(whole, "seconds", [60.0])),
+        evaluations=int(reader.numbers({"evaluations": [whole.pop("evaluations", 6)]}, "evaluations", [])[0]),
+        others=tuple(reader.other(one, f"others[{k}]") for k, one in enumerate(whole.pop("others", None) or [])),
+        name=reader.nothing_left(whole, path.stem),
+    )
+
+
+class _Reader:
+    def __init__(self, path: Path):
+        self.path = path
+
+    def wrong(self, place: str, found: object, expected: str) -> BenchmarkError:
+        return BenchmarkError(f"{self.path}: {place} is {found!r:.80}, expected {expected}")
+
+    def mapping(self, content: object, place: str) -> dict[str, Any]:
+        if not isinstance(content, Mapping):
+            raise self.wrong(place, content, "names with values")
+        return {str(key): value for key, value in content.items()}
+
+    def named(self, whole: dict[str, Any], key: str) -> list[tuple[str, Any]]:
+        found = self.mapping(whole.pop(key, None), key)
+        if not found:
+            raise self.wrong(key, found, "one entry or more")
+        return list(found.items())
+
+    def numbers(self, whole: dict[str, Any], key: str, default: list[float]) -> list[float]:
+        found = whole.pop(key, default)
+        if not isinstance(found, list) or not found or not all(isinstance(one, int | float) for one in found):
+            raise self.wrong(key, found, "one number or more")
+        return [float(one) for one in found]
+
+    def nothing_left(self, whole: dict[str, Any], name: str) -> str:
+        if whole:
+            known = ", ".join(one.name for one in fields(Manifest) if one.name != "name")
+            raise BenchmarkError(f"{self.path}: unknown key {', '.join(whole)}, expected among: {known}")
+        return name
+
+    def make(self, kind: type[T], content: object, place: str) -> T:
+        values = self.mapping(content, place)
+        known = [one.name for one in fields(kind)]  # pyright: ignore[reportArgumentType]
+        for key in values:
+            if key not in known:
+                raise BenchmarkError(f"{self.path}: unknown key {place}.{key}, expected among: {', '.join(known)}")
+        try:
+            return kind(**values)
+        except TypeError as error:
+            raise BenchmarkError(f"{self.path}: {place}: {error}") from None
+
+    def method(self, content: object, place: str) -> Method:
+        method = Method(content) if isinstance(content, str) else self.make(Method, content, place)
+        if method.role not in get_args(Role):
+            raise self.wrong(f"{place}.role", method.role, f"one of {', '.join(get_args(Role))}")
+        if not isinstance(method.command, str) or not method.words:
+            raise self.wrong(f"{place}.command", method.command, "what follows ns-train")
+        return method
+
+    def scene(self, content: object, place: str) -> Simulation | Path:
+        if isinstance(content, str):
+            return Path(content)
+        values = self.mapping(content, place)
+        sensor = self.make(SensorModel, values.pop("sensor", {}), f"{place}.sensor")
+        # What is wrong with the trajectory is a dimension of its own.
+        return self.make(Simulation, {**values, "sensor": sensor, "errors": _NO_ERRORS}, place)
+
+    def errors(self, content: object, place: str) -> TrajectoryErrors | None:
+        if content == "as given":
+            return None
+        values = {"position_noise": 0.0, "rotation_noise_rad": 0.0, **self.mapping(content, place)}
+        return self.make(TrajectoryErrors, values, place)
+
+    def other(self, content: object, place: str) -> Other:
+        values = self.mapping(content, place)
+        paths = {key: Path(values[key]) for key in ("refined", "renders") if values.get(key)}
+        return self.make(Other, {**values, **paths}, place)

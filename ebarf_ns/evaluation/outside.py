@@ -1,0 +1,52 @@
+"""What another program made of a scene, from its files alone."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ebarf_ns.errors import EvaluationError
+from ebarf_ns.evaluation.frames import image_errors, read_frame, read_pixels
+from ebarf_ns.evaluation.trajectory_error import Alignment, trajectory_error
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.scene import Scene
+
+_DARKEST = 1e-4
+
+
+def evaluate_files(scene: Scene, refined: Path, renders: Path | None) -> dict[str, Any]:
+    """Errors of a trajectory and, where given, of pictures named like the scene's frames, by the rules of our own runs.
+
+    Pictures are linear in intensity. Raises :class:`EvaluationError`.
+    """
+    results: dict[str, Any] = {}
+    if scene.groundtruth:
+        alignments: dict[Alignment, str] = {"sim3": "", "orientation": "_orientation"}
+        for alignment, suffix in alignments.items():
+            try:
+                error = trajectory_error(read_tum(refined), read_tum(scene.groundtruth), alignment)
+            except EvaluationError:
+                continue
+            results |= {f"ate_m{suffix}": error.ate_m, "rotation_deg": error.rotation_deg}
+    if renders:
+        rendered = [_log_brightness(_find(renders, frame.path.stem)) for frame in scene.frames]
+        references = [read_frame(frame) for frame in scene.frames]
+        for picture, reference, frame in zip(rendered, references, scene.frames, strict=True):
+            if picture.shape != reference.shape:
+                raise EvaluationError(
+                    f"{renders}: the picture of {frame.path.stem} has shape {picture.shape}, expected {reference.shape}"
+                )
+        results |= image_errors(rendered, references)
+    return results
+
+
+def _find(folder: Path, stem: str) -> Path:
+    found = sorted(folder.glob(f"{stem}.*"))
+    if not found:
+        raise EvaluationError(f"{folder}: holds no {stem}.*, expected a picture for every frame of the scene")
+    return found[0]
+
+
+def _log_brightness(path: Path) -> Float[np.ndarray, "height width"]:
+    return np.log(np.maximum(read_pixels(path), _DARKEST))

@@ -1,0 +1,106 @@
+"""A whole comparison in miniature, by the command that users type."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ebarf_ns.scene import read_scene
+from tests.conftest import run_command, run_ok
+
+MANIFEST = """
+methods:
+  ebarf: ebarf --pipeline.model.grid-finest 32 --pipeline.model.density-cells 32
+  broken: ebarf --pipeline.model.samples 0
+  floor:
+    command: enerf --pipeline.model.samples 16 --pipeline.model.grid-levels 4 --pipeline.model.grid-table-size-log2 10
+    role: floor
+scenes:
+  tiny: {scene: orbit, width: 24, height: 18, focal_px: 20.0, duration_s: 0.3, frames: 2}
+trajectories:
+  white: {position_noise: 0.03, rotation_noise_rad: 0.03}
+  drift: {position_drift: 0.05}
+seeds: [0]
+seconds: [1.5]
+evaluations: 2
+"""
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("comparison")
+    (folder / "mini.yaml").write_text(MANIFEST)
+    run_ok("ebarf", "bench", folder / "mini.yaml", "--output", folder / "out", timeout_s=600)
+    return folder
+
+
+def test_every_job_has_a_record_with_its_cost(comparison: Path):
+    result = json.loads((comparison / "out" / "records.json").read_text())
+    records = {(record["method"], record["trajectory"]): record for record in result["records"]}
+    assert set(records) == {(m, t) for m in ("ebarf", "broken") for t in ("white", "drift")} | {("floor", "true")}
+    for (method, _), record in records.items():
+        if method == "broken":
+            assert "samples" in record["error"] and not record["evaluations"]
+            continue
+        assert len(record["evaluations"]) >= 1
+        last = record["evaluations"][-1]
+        assert last["train_seconds"] >= 1.5 and last["event_pairs"] > 0 and last["heldout_event_loss"] <= 1.001
+    assert records["floor", "true"]["initial"]["rotation_deg"] < 1e-3
+    assert records["ebarf", "white"]["initial"]["rotation_deg"] > 1
+    assert records["ebarf", "drift"]["initial"]["ate_m"] != records["ebarf", "white"]["initial"]["ate_m"]
+
+
+def test_scenes_of_one_seed_share_their_events(comparison: Path):
+    white, drift = (comparison / "out" / "scenes" / f"tiny-0-{name}" for name in ("white", "drift"))
+    assert (white / "events.h5").samefile(drift / "events.h5")
+    assert (white / "trajectory.txt").read_text() != (drift / "trajectory.txt").read_text()
+
+
+def test_diagrams_and_tables_show_every_method(comparison: Path):
+    out = comparison / "out"
+    curves, profile = ((out / name).read_text() for name in ("work_precision.svg", "profile.svg"))
+    assert all(f"<!-- {name} -->" in curves for name in ("ebarf", "floor", "as given"))
+    # Floors have no problem of their own to solve.
+    assert "<!-- ebarf -->" in profile and "<!-- floor -->" not in profile
+    tables = (out / "tables.md").read_text()
+    assert "| tiny | white | ebarf |" in tables and "not reached" in tables and "2 trainings failed" in tables
+
+
+def test_a_stopped_comparison_goes_on_where_it_stopped(comparison: Path):
+    out = comparison / "out"
+    before = {path: path.stat().st_mtime_ns for path in (out / "results").glob("*.json")}
+    removed = next(path for path in before if "-ebarf" in path.name)
+    removed.unlink()
+    result = json.loads(run_ok("ebarf", "bench", comparison / "mini.yaml", "--output", out, "--json", timeout_s=600))
+    assert len(result["records"]) == 5
+    after = {path: path.stat().st_mtime_ns for path in (out / "results").glob("*.json")}
+    assert {path for path in before if after[path] != before[path]} == {removed}
+
+
+def test_another_program_joins_by_its_files(comparison: Path, tmp_path: Path):
+    scene = read_scene(comparison / "out" / "scenes" / "tiny-0")
+    assert scene.groundtruth
+    shutil.copy(scene.groundtruth, tmp_path / "theirs.txt")
+    (tmp_path / "pictures").mkdir()
+    for frame in scene.frames:
+        picture = cv2.imread(str(frame.path), -1)
+        assert picture is not None
+        np.save(tmp_path / "pictures" / f"{frame.path.stem}.npy", (picture / 65535.0) ** 0.5 + 0.001)
+    theirs = f"theirs, scene: tiny, trajectory: white, seed: 0, seconds: 77, refined: {tmp_path / 'theirs.txt'}"
+    text = MANIFEST + f"others:\n  - {{method: {theirs}, renders: {tmp_path / 'pictures'}}}\n"
+    (comparison / "joined.yaml").write_text(text)
+    result = json.loads(run_ok("ebarf", "bench", comparison / "joined.yaml", "--output", comparison / "out", "--json"))
+    (record,) = (record for record in result["records"] if record["method"] == "theirs")
+    (evaluation,) = record["evaluations"]
+    assert evaluation["ate_m"] < 1e-6 and evaluation["psnr"] > 50 and evaluation["train_seconds"] == 77
+    (tmp_path / "pictures" / f"{scene.frames[0].path.stem}.npy").unlink()
+    finished = run_command("ebarf", "bench", comparison / "joined.yaml", "--output", comparison / "out")
+    assert finished.code == 2 and "expected a picture for every frame" in finished.errors
+
+
+def test_a_manifest_that_is_none_is_refused_in_one_line(tmp_path: Path):
+    finished = run_command("ebarf", "bench", "enigne")
+    assert finished.code == 2 and "enigne" in finished.errors and "Traceback" not in finished.errors

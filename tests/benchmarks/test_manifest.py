@@ -1,0 +1,89 @@
+from pathlib import Path
+
+import pytest
+
+from ebarf_ns.benchmarks.comparison import TRUE, jobs
+from ebarf_ns.benchmarks.manifest import read_manifest
+from ebarf_ns.errors import BenchmarkError
+from ebarf_ns.simulation.simulate import Simulation
+from tests.conftest import REPOSITORY
+
+WHOLE = """
+methods:
+  ebarf: ebarf
+  floor: {command: ebarf --pipeline.model.camera-optimizer.mode off, role: floor}
+scenes:
+  room: {scene: orbit, frames: 2, sensor: {leak_hz: 0.1}}
+  slide: some/folder
+trajectories:
+  white: {position_noise: 0.03}
+  given: as given
+seeds: [0, 4]
+seconds: [5, 10]
+evaluations: 3
+others:
+  - {method: theirs, scene: room, trajectory: white, seed: 0, seconds: 99, refined: theirs.txt}
+"""
+
+
+def read(tmp_path: Path, text: str):
+    path = tmp_path / "some.yaml"
+    path.write_text(text)
+    return read_manifest(path)
+
+
+def test_a_manifest_says_what_is_compared(tmp_path: Path):
+    manifest = read(tmp_path, WHOLE)
+    assert manifest.name == "some" and manifest.seeds == (0, 4) and manifest.seconds == (5, 10)
+    assert manifest.methods["floor"].words[1:] == ["--pipeline.model.camera-optimizer.mode", "off"]
+    room = manifest.scenes["room"]
+    assert isinstance(room, Simulation) and room.scene == "orbit" and room.sensor.leak_hz == 0.1
+    assert manifest.scenes["slide"] == Path("some/folder") and manifest.others[0].refined == Path("theirs.txt")
+    white = manifest.trajectories["white"]
+    assert (
+        white and white.position_noise == 0.03 and white.rotation_noise_rad == 0 and not manifest.trajectories["given"]
+    )
+
+
+def test_floors_are_trained_once_whatever_the_trajectory(tmp_path: Path):
+    found = jobs(read(tmp_path, WHOLE))
+    assert len(found) == len(set(found)) == 2 * 2 * 2 * (2 + 1)
+    assert {job.trajectory for job in found if job.method == "floor"} == {TRUE}
+    assert len({job.name for job in found}) == len(found) and all("/" not in job.name for job in found)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((REPOSITORY / "configs" / "benchmarks").glob("*.yaml")), ids=lambda path: path.stem
+)
+def test_shipped_manifests_are_whole(path: Path):
+    manifest = read_manifest(path)
+    assert jobs(manifest) and len(manifest.seeds) >= 3
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "the file is None, expected names with values"),
+        ("methods: [", "not valid YAML"),
+        ("scenes: {}", "methods is None"),
+        (WHOLE + "colour: red\n", "unknown key colour, expected among: methods"),
+        (WHOLE.replace("role: floor", "role: roof"), "methods.floor.role is 'roof', expected one of method, floor"),
+        (WHOLE.replace("ebarf: ebarf", "ebarf: {flags: 3}"), "unknown key methods.ebarf.flags"),
+        (WHOLE.replace("ebarf: ebarf", "ebarf: {role: floor}"), "methods.ebarf: .*command"),
+        (WHOLE.replace("leak_hz", "leek_hz"), "unknown key scenes.room.sensor.leek_hz"),
+        (WHOLE.replace("frames: 2", "frame: 2"), "unknown key scenes.room.frame"),
+        (WHOLE.replace("{position_noise: 0.03}", "0.03"), "trajectories.white is 0.03"),
+        (WHOLE.replace("seeds: [0, 4]", "seeds: 3"), "seeds is 3, expected one number or more"),
+        (WHOLE.replace("[5, 10]", "[5, fast]"), "seconds is .5, 'fast'."),
+        (WHOLE.replace("evaluations: 3", "evaluations: many"), "evaluations is .'many'."),
+        (WHOLE.replace(", refined: theirs.txt", ""), "others.0.: .*refined"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, complaint: str):
+    with pytest.raises(BenchmarkError, match=complaint):
+        read(tmp_path, text)
+
+
+def test_a_missing_manifest_is_named(tmp_path: Path):
+    with pytest.raises(BenchmarkError, match="nothing.yaml: No such file"):
+        read_manifest(tmp_path / "nothing.yaml")

@@ -1,0 +1,45 @@
+import math
+
+import pytest
+
+from ebarf_ns.evaluation.diagrams import error_of, performance_profile, seconds_to, tables
+
+
+def record(method: str, seed: int, errors_m: list[float], seconds: float = 20.0) -> dict:
+    evaluations = [
+        {"train_seconds": seconds * (k + 1) / len(errors_m), "ate_m": error_m, "psnr": 20.0 + k, "rotation_deg": 1.0}
+        for k, error_m in enumerate(errors_m)
+    ]
+    job = {"method": method, "scene": "room", "trajectory": "white", "seed": seed, "seconds": seconds}
+    return {**job, "initial": {"ate_m": 0.05, "rotation_deg": 3.0}, "evaluations": evaluations}
+
+
+def test_image_error_is_the_root_mean_square_and_unknown_errors_are_infinite():
+    assert error_of({"psnr": 20.0}, "image") == pytest.approx(0.1)
+    assert error_of({"psnr": None}, "image") == math.inf and error_of({}, "ate_m") == math.inf
+    assert error_of({"ate_m": None, "ate_m_orientation": 0.02}, "ate_m") == 0.02
+
+
+def test_time_to_target_is_the_first_time_and_infinite_where_never():
+    records = [record("ebarf", 0, [0.04, 0.02, 0.01, 0.015]), record("ebarf", 0, [0.009], seconds=60.0)]
+    assert seconds_to(records, "ate_m", 0.02) == 10 and seconds_to(records, "ate_m", 0.0095) == 60
+    assert seconds_to(records, "ate_m", 0.001) == math.inf
+
+
+def test_profile_counts_problems_within_a_factor_of_the_fastest():
+    seconds = {"fast": [1.0, 2.0, math.inf, math.inf], "slow": [3.0, 2.0, 5.0, math.inf]}
+    profile = performance_profile(seconds, [1.0, 2.9, 3.0, 1e9])
+    assert profile == {"fast": [0.5, 0.5, 0.5, 0.5], "slow": [0.5, 0.5, 0.75, 0.75]}
+
+
+def test_tables_show_medians_and_what_was_not_reached():
+    result = {
+        "machine": "a machine", "date": "today", "roles": {"ebarf": "method"},
+        "records": [record("ebarf", seed, [0.04, final]) for seed, final in enumerate((0.011, 0.004, 0.03))],
+    }  # fmt: skip
+    text = tables(result)
+    assert "| room | white | as given |  |  | 0.05 m | 3 deg |  |" in text
+    assert "| room | white | ebarf | 20 s | 21 dB | 0.011 m | 1 deg | - |" in text
+    row = next(line for line in text.splitlines() if line.startswith("| room | white | ebarf | 10"))
+    # 20 dB at once, 22 dB never; 5 cm at once, 2 cm after 20 s, 1 cm by one seed of three only.
+    assert row == "| room | white | ebarf | 10 |" + " not reached |" * 4 + " 10 | 20 | not reached | not reached |"

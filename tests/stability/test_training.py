@@ -1,0 +1,361 @@
+"""Trainings that are killed, broken, resumed or fed the worst: cases 25 to 29, and the stiff scenes."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from ebarf_ns.events.recording import Recording, read_recording, write_recording
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
+from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
+from ebarf_ns.simulation.catalogue import Place
+from ebarf_ns.simulation.motion import HandheldMotion
+from ebarf_ns.simulation.room import Room
+from ebarf_ns.simulation.sensor import SensorModel
+from ebarf_ns.simulation.simulate import Simulation, simulate
+from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors
+from tests.conftest import REPOSITORY
+from tests.nerf.test_training import config, same, state, trainer
+
+KILLS = 50
+STEPS = 40
+UNITS_AGREE = 0.15
+FAR_AGREES = 0.25
+NOTHING_LEARNED = 0.7
+LOST_DEG = 10.0
+SMALL = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.4, frames=2)
+
+
+@pytest.fixture(scope="module")
+def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate(SMALL, tmp_path_factory.mktemp("stiff") / "scene").folder
+
+
+def newest_checkpoint(folder: Path) -> dict:
+    return torch.load(max(folder.glob("step-*.ckpt")), weights_only=True)
+
+
+def test_case_25_a_kill_while_saving_always_leaves_a_whole_checkpoint(small_scene: Path, tmp_path: Path):
+    ready = trainer(config(small_scene, tmp_path))
+    ready.steps_done = 1
+    ready.save_checkpoint(0)
+    chance = random.Random(0)
+    for _ in range(KILLS):
+        child = os.fork()
+        if child == 0:
+            # Forked in the midst of a test run: nothing but saving, and no way out but the kill.
+            while True:
+                ready.steps_done += 1
+                ready.save_checkpoint(0)
+        time.sleep(chance.uniform(0.0, 0.03))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        assert newest_checkpoint(ready.checkpoint_dir)["ebarf"]["event_pairs"] == 0
+
+
+def test_case_25_a_full_disk_leaves_the_older_checkpoint(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ready = trainer(config(small_scene, tmp_path))
+    ready.steps_done = 5
+    ready.save_checkpoint(0)
+
+    def fill(state: dict, path: Path) -> None:
+        path.write_bytes(b"half of a checkpoint")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", fill)
+    ready.steps_done = 9
+    with pytest.raises(OSError, match="No space left"):
+        ready.save_checkpoint(0)
+    assert [path.name for path in ready.checkpoint_dir.iterdir()] == ["step-000000004.ckpt"]
+    assert newest_checkpoint(ready.checkpoint_dir)["step"] == 4 and not list(ready.base_dir.glob("*.ckpt"))
+
+
+RESUME = """
+import sys
+from pathlib import Path
+import torch
+from tests.nerf.test_training import config, state, trainer
+scene, output, checkpoints = map(Path, sys.argv[1:])
+made = config(scene, output)
+made.load_dir = checkpoints
+ready = trainer(made)
+assert ready.steps_done == 7 and ready.field_restarted
+ready.train()
+torch.save(state(ready), output / "end.pt")
+"""
+
+
+def test_case_26_a_run_resumed_in_another_process_ends_bitwise_where_an_uninterrupted_one_does(
+    small_scene: Path, tmp_path: Path
+):
+    whole = trainer(config(small_scene, tmp_path / "whole"))
+    whole.train()
+    first = trainer(config(small_scene, tmp_path / "first"))
+    for step in range(7):
+        first.pipeline.train()
+        first.train_iteration(step)
+    first.save_checkpoint(6)
+    (tmp_path / "second").mkdir()
+    command = [sys.executable, "-c", RESUME, small_scene, tmp_path / "second", first.checkpoint_dir]
+    # As many threads as here: sums come out the same.
+    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
+    subprocess.run(command, check=True, cwd=REPOSITORY, env=environment, stdout=subprocess.DEVNULL)
+    assert same(state(whole), torch.load(tmp_path / "second" / "end.pt", weights_only=True))
+
+
+@pytest.mark.parametrize("broken", ["loss", "field", "poses"])
+def test_case_27_a_step_with_a_broken_gradient_changes_nothing(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
+):
+    made = config(small_scene, tmp_path)
+    made.restart_field_at = None
+    ready = trainer(made)
+    ready.pipeline.train()
+    ready.train_iteration(0)
+    model, before = ready.pipeline.model, state(ready)
+    moments = [str(one.state_dict()["state"]) for one in ready.optimizers.optimizers.values()]
+    if broken == "loss":
+        good = model.get_loss_dict
+        monkeypatch.setattr(model, "get_loss_dict", lambda *of: {k: v * float("inf") for k, v in good(*of).items()})
+        undo = monkeypatch.undo
+    else:
+        poisoned = model.camera_optimizer.correction if broken == "poses" else model.renderer.field.grid.table
+        undo = poisoned.register_hook(lambda gradient: gradient * float("nan")).remove
+    remembered = {name for name in before if "density_grid" in name or "display_range" in name}
+    ready.train_iteration(1)
+    after = state(ready)
+    assert all(torch.equal(before[name], after[name]) for name in before if name not in remembered)
+    assert moments == [str(one.state_dict()["state"]) for one in ready.optimizers.optimizers.values()]
+    assert ready.optimizers.skipped == 1
+    undo()
+    ready.train_iteration(2)
+    assert not same(after, state(ready)) and ready.optimizers.skipped_in_a_row == 0
+
+
+def test_case_27_ten_broken_steps_in_a_row_end_the_run(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    ready = trainer(config(small_scene, tmp_path, steps=50))
+    ready.pipeline.model.camera_optimizer.correction.register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(SystemExit) as stopped:
+        ready.train()
+    assert stopped.value.code == 2 and "10 training steps in a row" in capsys.readouterr().err
+
+
+def test_case_28_poses_without_gradients_under_mixed_precision_do_not_end_the_run(small_scene: Path, tmp_path: Path):
+    made = config(small_scene, tmp_path, steps=6)
+    made.mixed_precision = made.use_grad_scaler = True
+    ready = trainer(made)
+    ready.pipeline.model.camera_optimizer.correction.requires_grad_(False)
+    ready.train()
+    assert ready.steps_done == 6
+
+
+MODEL_CHANGES = {
+    "loss": "normalized", "brightness": "lin_log", "intensity_range": "unit", "view_dependent": True, "grid_levels": 5,
+    "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
+    "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3, "density_bias": 1.0,
+    "contract": True, "precision": "bfloat16", "all_levels_from": 1.0,
+}  # fmt: skip
+POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
+DATA_CHANGES = {"train_num_rays_per_batch": 64, "longest_pair": 3, "heldout_share": 0.2, "seed": 5}
+
+
+@pytest.mark.parametrize("key", [*MODEL_CHANGES, *DATA_CHANGES, *POSE_CHANGES])
+def test_case_29_every_field_of_the_configuration_changes_the_run(small_scene: Path, tmp_path: Path, key: str):
+    losses = []
+    for change in (False, True):
+        made = config(small_scene, tmp_path, steps=3)
+        if change and key in MODEL_CHANGES:
+            setattr(made.pipeline.model, key, MODEL_CHANGES[key])
+        if change and key in DATA_CHANGES:
+            setattr(made.machine if key == "seed" else made.pipeline.datamanager, key, DATA_CHANGES[key])
+        if change and key in POSE_CHANGES:
+            setattr(made.pipeline.model.camera_optimizer, key, POSE_CHANGES[key])  # pyright: ignore[reportAttributeAccessIssue]
+        torch.manual_seed(0)
+        ready = made.setup(local_rank=0, world_size=1)
+        ready.setup()
+        ready.pipeline.train()
+        losses.append([float(ready.train_iteration(step)[0].detach()) for step in range(3)])
+    assert losses[0] != losses[1], f"{key} changed nothing"
+
+
+# The worst that scenes can be: finite to the end, and an honest report.
+
+
+def variant(
+    source: Path,
+    folder: Path,
+    events: Callable[[Recording], Recording] = lambda recording: recording,
+    trajectory: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory,
+    **changes: object,
+) -> Path:
+    """A copy of a scene with other events, other trajectories (both alike) and other entries in scene.json."""
+    shutil.copytree(source, folder)
+    write_recording(folder / "events.h5", events(read_recording(folder / "events.h5", SMALL.width, SMALL.height)))
+    for name in ("trajectory.txt", "groundtruth.txt"):
+        write_tum(folder / name, trajectory(read_tum(folder / name)))
+    content = json.loads((folder / "scene.json").read_text())
+    (folder / "scene.json").write_text(json.dumps({**content, **changes}))
+    return folder
+
+
+def trained(scene: Path, output: Path, **model: object) -> dict:
+    """The last evaluation of a short training of what users get, all of whose numbers must be finite or null."""
+    made = config(scene, output, steps=STEPS)
+    for name, value in model.items():
+        setattr(made.pipeline.model, name, value)
+    ready = trainer(made)
+    ready.train()
+    run = output / "x" / "ebarf" / "run"
+    *_, last = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert last["step"] == STEPS and last["skipped_steps"] == 0
+    assert all(np.isfinite(value) for value in last.values() if isinstance(value, int | float))
+    refined = read_tum(run / "trajectory_refined.txt")
+    assert torch.isfinite(refined.poses.position).all() and torch.isfinite(refined.poses.quat_wxyz).all()
+    assert all(
+        torch.isfinite(value).all() for value in ready.pipeline.state_dict().values() if value.is_floating_point()
+    )
+    assert (run / "report" / "report.html").is_file()
+    return last
+
+
+def resampled(t_us: torch.Tensor) -> Callable[[Trajectory], Trajectory]:
+    return lambda given: Trajectory(t_us, interpolate(given.t_us, given.poses, t_us))
+
+
+def test_keyframes_a_microsecond_apart(small_scene: Path, tmp_path: Path):
+    t_us = torch.tensor([0, 100_000, 100_001, 200_000, 200_001, 200_002, 400_000])
+    last = trained(variant(small_scene, tmp_path / "scene", trajectory=resampled(t_us)), tmp_path)
+    assert last["heldout_event_loss"] < 1
+
+
+def test_ten_thousand_keyframes(small_scene: Path, tmp_path: Path):
+    t_us = torch.arange(10_000) * 40
+    last = trained(variant(small_scene, tmp_path / "scene", trajectory=resampled(t_us)), tmp_path)
+    assert last["heldout_event_loss"] < 1 and last["rotation_deg"] < LOST_DEG
+
+
+def test_one_keyframe_interval_holds_all_events(small_scene: Path, tmp_path: Path):
+    last = trained(variant(small_scene, tmp_path / "scene", trajectory=resampled(torch.tensor([0, 400_000]))), tmp_path)
+    # Two poses cannot be aligned: no number is better than a wrong one.
+    assert last["ate_m"] is None and last["heldout_event_loss"] < 1
+
+
+@pytest.mark.parametrize("threshold", [0.01, 2.0])
+def test_thresholds_far_from_usual(tmp_path: Path, threshold: float):
+    duration_s = 0.1 if threshold < 0.1 else 2.0
+    sensor = SensorModel(threshold_on=threshold, threshold_off=threshold)
+    simulate(replace(SMALL, sensor=sensor, duration_s=duration_s), tmp_path / "scene")
+    assert trained(tmp_path / "scene", tmp_path)["heldout_event_loss"] <= 1.001
+
+
+def test_radiance_over_six_decades(tmp_path: Path):
+    room = Room(window=(-1.2, -0.4, 0.6, 1.0), daylight=1e6)
+    scene = simulate(SMALL, tmp_path / "scene", place=Place(room, HandheldMotion()))
+    assert trained(scene.folder, tmp_path)["heldout_event_loss"] < 1
+
+
+def test_a_hot_pixel_with_a_million_events(small_scene: Path, tmp_path: Path):
+    def with_hot_pixel(given: Recording) -> Recording:
+        hot = 1_000_000
+        t_us = np.r_[given.t_us, np.random.default_rng(0).integers(0, 400_000, hot)]
+        order = np.argsort(t_us, kind="stable")
+        x, y = (np.r_[column, np.full(hot, 7, np.uint16)][order] for column in (given.x, given.y))
+        polarity = np.r_[given.polarity, np.resize(np.array([1, -1], np.int8), hot)][order]
+        return Recording(x, y, t_us[order], polarity)
+
+    clean = trained(small_scene, tmp_path / "clean")
+    hot = trained(variant(small_scene, tmp_path / "scene", events=with_hot_pixel), tmp_path / "hot")
+    assert hot["rotation_deg"] < 1.3 * clean["rotation_deg"] and hot["psnr"] > clean["psnr"] - 2
+
+
+def test_all_polarities_equal(small_scene: Path, tmp_path: Path):
+    def brighter(given: Recording) -> Recording:
+        return replace(given, polarity=np.ones_like(given.polarity))
+
+    last = trained(variant(small_scene, tmp_path / "scene", events=brighter), tmp_path)
+    assert last["heldout_event_loss"] <= 1.001 and last["implied_threshold_off"] is None
+
+
+def test_pure_rotation(tmp_path: Path):
+    motion = HandheldMotion(sway_m=(0.0, 0.0, 0.0), turn_rad=0.3)
+    scene = simulate(SMALL, tmp_path / "scene", place=Place(Room(), motion))
+    last = trained(scene.folder, tmp_path)
+    # There is no path whose scale could be aligned; rotations still are.
+    assert last["ate_m"] is None and last["scale"] is None and last["heldout_event_loss"] < 1
+
+
+def test_no_motion(small_scene: Path, tmp_path: Path):
+    def still(given: Trajectory) -> Trajectory:
+        return Trajectory(given.t_us, Poses(*(column[:1].expand(len(given.t_us), -1) for column in given.poses)))
+
+    last = trained(variant(small_scene, tmp_path / "scene", trajectory=still, bounds=None), tmp_path, contract=True)
+    # The events are of a motion that the trajectory knows nothing of: nothing can explain them, and that is said.
+    assert last["heldout_event_loss"] > NOTHING_LEARNED and last["ate_m"] is None
+
+
+def test_a_kilometre_away_and_half_a_century_late(small_scene: Path, tmp_path: Path):
+    shift_us, shift_m = 1_700_000_000 * 10**6, 1000.0
+
+    def far(given: Trajectory) -> Trajectory:
+        return Trajectory(given.t_us + shift_us, Poses(given.poses.position + shift_m, given.poses.quat_wxyz))
+
+    def late(given: Recording) -> Recording:
+        return replace(given, t_us=given.t_us + shift_us)
+
+    bounds = (np.array(json.loads((small_scene / "scene.json").read_text())["bounds"]) + shift_m).tolist()
+    scene = variant(small_scene, tmp_path / "scene", events=late, trajectory=far, bounds=bounds)
+    frames = json.loads((scene / "frames.json").read_text())
+    (scene / "frames.json").write_text(json.dumps([{**one, "t_us": one["t_us"] + shift_us} for one in frames]))
+    here, there = trained(small_scene, tmp_path / "here"), trained(scene, tmp_path / "there")
+    for name in ("heldout_event_loss", "ate_m", "rotation_deg", "psnr"):
+        assert there[name] == pytest.approx(here[name], rel=FAR_AGREES), name
+
+
+@pytest.mark.parametrize("size", [1e-3 / 4, 1e4 / 4])
+def test_a_scene_of_a_millimetre_and_one_of_ten_kilometres(small_scene: Path, tmp_path: Path, size: float):
+    def scaled(given: Trajectory) -> Trajectory:
+        return Trajectory(given.t_us, Poses(size * given.poses.position, given.poses.quat_wxyz))
+
+    bounds = (size * np.array(json.loads((small_scene / "scene.json").read_text())["bounds"])).tolist()
+    scene = variant(small_scene, tmp_path / "scene", trajectory=scaled, bounds=bounds)
+    here, there = trained(small_scene, tmp_path / "here"), trained(scene, tmp_path / "there")
+    assert there["ate_m"] == pytest.approx(size * here["ate_m"], rel=UNITS_AGREE)
+    for name in ("heldout_event_loss", "rotation_deg", "psnr"):
+        assert there[name] == pytest.approx(here[name], rel=UNITS_AGREE), name
+
+
+def test_an_error_so_large_that_nothing_can_converge_is_reported_as_such(small_scene: Path, tmp_path: Path):
+    scene = tmp_path / "scene"
+    shutil.copytree(small_scene, scene)
+    given = read_tum(scene / "trajectory.txt")
+    quat = Rotation.random(len(given.t_us), rng=np.random.default_rng(0)).as_quat()[:, [3, 0, 1, 2]]
+    write_tum(scene / "trajectory.txt", Trajectory(given.t_us, Poses(given.poses.position, torch.from_numpy(quat))))
+    last = trained(scene, tmp_path)
+    assert last["rotation_deg"] > LOST_DEG and last["heldout_event_loss"] > NOTHING_LEARNED
+
+
+def test_drift_of_thresholds_costs_no_more_than_a_fifth(tmp_path: Path):
+    """Case 20: C drifts by 20 % either way within the recording."""
+    ends = []
+    for drift in (0.0, 0.4):
+        sensor = SensorModel(threshold_drift=drift)
+        errors = TrajectoryErrors(position_noise=0.03, rotation_noise_rad=0.03)
+        scene = simulate(replace(SMALL, sensor=sensor, errors=errors, duration_s=0.8), tmp_path / f"scene{drift}")
+        ends.append(trained(scene.folder, tmp_path / f"run{drift}"))
+    assert ends[1]["ate_m"] <= 1.2 * ends[0]["ate_m"]
