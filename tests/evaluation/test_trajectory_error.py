@@ -1,3 +1,10 @@
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -114,3 +121,22 @@ def test_reference_poses_are_found_in_the_estimates_world():
     placed = reference_in_estimates_world(estimate, reference, reference.t_us)
     assert torch.allclose(placed.position, estimate.poses.position, atol=1e-9)
     assert torch.allclose(placed.matrix(), estimate.poses.matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize(("alignment", "flags"), [("se3", ["-a"]), ("sim3", ["-a", "-s"])])
+def test_errors_are_those_of_evos_command_line(tmp_path: Path, alignment: str, flags: list[str]):
+    position, turn = wander(40)
+    random = np.random.default_rng(3)
+    noisy = 1.3 * position + 0.05 * random.standard_normal(position.shape)
+    write_tum(tmp_path / "truth.txt", make(position, turn))
+    write_tum(
+        tmp_path / "estimate.txt", make(noisy, turn * Rotation.from_rotvec(0.1 * random.standard_normal((40, 3))))
+    )
+    ours = compare_files(tmp_path / "estimate.txt", tmp_path / "truth.txt")[alignment]
+    for relation, statistic, mine in (("trans_part", "rmse", ours["ate_m"]), ("full", "mean", ours["ape_full"])):
+        words = ["tum", "truth.txt", "estimate.txt", *flags, "-r", relation, "--save_results", f"{relation}.zip"]
+        command = [Path(sys.executable).parent / "evo_ape", *words]
+        environment = {**os.environ, "HOME": str(tmp_path)}
+        subprocess.run(command, check=True, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+        with zipfile.ZipFile(tmp_path / f"{relation}.zip") as results:
+            assert mine == pytest.approx(json.loads(results.read("stats.json"))[statistic], abs=1e-9)
