@@ -136,7 +136,8 @@ def write_scene(scene: Scene) -> None:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return path.relative_to(folder).as_posix()
+    """The path of a file as scene.json has it: from the folder, or absolute for files elsewhere."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.resolve().as_posix()
 
 
 def _camera_json(camera: Camera) -> dict[str, Any]:

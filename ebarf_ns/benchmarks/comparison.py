@@ -1,29 +1,28 @@
 """Methods x scenes x trajectories x seeds x seconds: trained one after another, stopped and gone on with at will."""
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import date
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ebarf_ns.benchmarks.engine import machine
-from ebarf_ns.benchmarks.manifest import Manifest, Other
+from ebarf_ns.benchmarks.manifest import TRUE, Manifest, Other
 from ebarf_ns.benchmarks.training import train
 from ebarf_ns.errors import BenchmarkError
 from ebarf_ns.evaluation.outside import evaluate_files
 from ebarf_ns.files import whole_file, whole_folder
 from ebarf_ns.geometry.trajectory import Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
-from ebarf_ns.scene import Scene, read_scene
+from ebarf_ns.scene import Scene, read_scene, write_scene
 from ebarf_ns.simulation.simulate import simulate
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
 
-TRUE = "true"
 _TRUE_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
 
 
@@ -37,11 +36,13 @@ class Job:
     seed: int
     seconds: float
 
-    @property
-    def name(self) -> str:
-        """A folder's name."""
-        words = f"{self.scene}-{self.trajectory}-{self.seed}-{self.seconds:g}s-{self.method}"
-        return "".join(letter if letter.isalnum() or letter in "-._" else "_" for letter in words)
+    def name(self, *made_of: object) -> str:
+        """A folder's name, which changes with whatever the training is made of."""
+        return _named(f"{self.scene}-{self.trajectory}-{self.seed}-{self.seconds:g}s-{self.method}", *made_of)
+
+
+def _named(words: str, *made_of: object) -> str:
+    return f"{words.replace(' ', '_')}-{sha256(repr(made_of).encode()).hexdigest()[:8]}"
 
 
 def jobs(manifest: Manifest) -> list[Job]:
@@ -85,14 +86,14 @@ def run_comparison(
 
 
 def _result(manifest: Manifest, job: Job, folder: Path) -> dict[str, Any]:
-    path = folder / "results" / f"{job.name}.json"
+    scene, method = _scene(manifest, job, folder), manifest.methods[job.method]
+    name = job.name(scene.name, method, manifest.evaluations)
+    path = folder / "results" / f"{name}.json"
     if path.is_file():
         return json.loads(path.read_text(encoding="utf-8"))
-    scene = _scene(manifest, job, folder)
-    shutil.rmtree(folder / "runs" / job.name, ignore_errors=True)
     record = {**vars(job), "initial": _initial_errors(read_scene(scene)), "evaluations": []}
-    method = manifest.methods[job.method]
-    run = folder / "runs" / job.name / method.words[0] / "run"
+    run = folder / "runs" / name / method.words[0] / "run"
+    shutil.rmtree(folder / "runs" / name, ignore_errors=True)
     try:
         record["evaluations"] = train(method.words, scene, run, job.seed, job.seconds, manifest.evaluations)
     except BenchmarkError as error:
@@ -107,28 +108,23 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> Path:
     source = manifest.scenes[job.scene]
     if not isinstance(source, Path):
         simulation = replace(source, seed=job.seed)
-        source = folder / "scenes" / f"{job.scene}-{job.seed}"
+        source = folder / "scenes" / _named(f"{job.scene}-{job.seed}", simulation)
         if not (source / "scene.json").is_file():
             simulate(simulation, source)
     errors = _TRUE_ERRORS if job.trajectory == TRUE else manifest.trajectories[job.trajectory]
     if errors is None:
         return source
-    made = folder / "scenes" / f"{job.scene}-{job.seed}-{job.trajectory}"
+    scene = read_scene(source)
+    contents = [path.read_bytes() for path in (source / "scene.json", scene.trajectory, scene.groundtruth) if path]
+    made = folder / "scenes" / _named(f"{job.scene}-{job.seed}-{job.trajectory}", errors, job.seed, contents)
     if not (made / "scene.json").is_file():
-        scene = read_scene(source)
         with whole_folder(made) as temporary:
-            shutil.copytree(source, temporary, copy_function=_link, dirs_exist_ok=True)
-            placed = temporary / scene.trajectory.relative_to(source)
-            write_tum(placed, perturb(_true_keyframes(scene), errors, job.seed))
+            # Everything else stays where it is.
+            trajectory = temporary / "trajectory.txt"
+            write_tum(trajectory, perturb(_true_keyframes(scene), errors, job.seed))
+            lower_upper = scene.bounds and tuple(tuple(errors.scale * one for one in corner) for corner in scene.bounds)
+            write_scene(replace(scene, folder=temporary, trajectory=trajectory, bounds=lower_upper or None))
     return made
-
-
-def _link(source: str, target: str) -> None:
-    """Files are replaced, never changed, so that two folders can share them."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
 
 
 def _true_keyframes(scene: Scene) -> Trajectory:
@@ -145,8 +141,6 @@ def _initial_errors(scene: Scene) -> dict[str, float | None]:
 
 def _joined(manifest: Manifest, other: Other, folder: Path) -> dict[str, Any]:
     """What another program reached, from its files."""
-    if other.scene not in manifest.scenes or other.trajectory not in manifest.trajectories:
-        raise BenchmarkError(f"others: {other.method} names {other.scene} and {other.trajectory}, not in the manifest")
     job = Job(other.method, other.scene, other.trajectory, other.seed, float(other.seconds))
     scene = read_scene(_scene(manifest, job, folder))
     evaluation = {"train_seconds": job.seconds, **evaluate_files(scene, other.refined, other.renders)}

@@ -189,6 +189,23 @@ class _Engine:
 
         yield Figure(f"a {width} x {height} frame", _seconds(once, self._repetitions), "s", at_most=1.5)
 
+    def simulator(self) -> Iterator[Figure]:
+        """A second of handheld motion before a DAVIS240C, from command to scene folder but for the imports."""
+        name = "simulating 1 s at 240 x 180"
+        if not (find_spec("scipy") and find_spec("cv2")):
+            yield Figure(name, None, "s")
+            return
+        from ebarf_ns.simulation.simulate import Simulation, simulate
+
+        small = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.2, frames=1)
+        large = Simulation(width=240, height=180, focal_px=206.0, duration_s=1.0)
+        with tempfile.TemporaryDirectory() as folder:
+            # Compiled before the clock starts.
+            simulate(small, Path(folder) / "small")
+            started = perf_counter()
+            simulate(small if self.quick else large, Path(folder) / "large")
+            yield Figure(name, perf_counter() - started, "s", at_most=20)
+
     def index(self) -> Iterator[Figure]:
         """An index of many events from a file, in memory and in a file of its own."""
         events = 100_000 if self.quick else 100_000_000

@@ -1,10 +1,13 @@
 """What a comparison consists of: methods x scenes x trajectories x seeds x seconds, read from a YAML file."""
 
+import math
+import re
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -15,6 +18,8 @@ from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors
 
 Role = Literal["method", "floor", "ceiling"]
 T = TypeVar("T")
+TRUE = "true"
+"""The trajectory that floors get."""
 _NO_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
 
 
@@ -76,7 +81,7 @@ def read_manifest(path: Path) -> Manifest:
         raise BenchmarkError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     reader = _Reader(path)
     whole = reader.mapping(content, "the file")
-    return Manifest(
+    manifest = Manifest(
         methods={key: reader.method(value, f"methods.{key}") for key, value in reader.named(whole, "methods")},
         scenes={key: reader.scene(value, f"scenes.{key}") for key, value in reader.named(whole, "scenes")},
         trajectories={
@@ -85,9 +90,19 @@ def read_manifest(path: Path) -> Manifest:
         seeds=tuple(map(int, reader.numbers(whole, "seeds", [0, 1, 2]))),
         seconds=tuple(reader.numbers(whole, "seconds", [60.0])),
         evaluations=int(reader.numbers({"evaluations": [whole.pop("evaluations", 6)]}, "evaluations", [])[0]),
-        others=tuple(reader.other(one, f"others[{k}]") for k, one in enumerate(whole.pop("others", None) or [])),
+        others=reader.others(whole.pop("others", None) or []),
         name=reader.nothing_left(whole, path.stem),
     )
+    for other in manifest.others:
+        if other.scene not in manifest.scenes or other.trajectory not in manifest.trajectories:
+            raise BenchmarkError(
+                f"{path}: {other.method} is of scene {other.scene!r} and trajectory {other.trajectory!r}, "
+                "expected some of this manifest"
+            )
+        for file in (other.refined, other.renders):
+            if file and not file.exists():
+                raise BenchmarkError(f"{path}: {other.method} names {file}, but there is no such file")
+    return manifest
 
 
 class _Reader:
@@ -106,12 +121,16 @@ class _Reader:
         found = self.mapping(whole.pop(key, None), key)
         if not found:
             raise self.wrong(key, found, "one entry or more")
+        for name in found:
+            # Names become those of files.
+            if not re.fullmatch(r"[\w .,+-]+", name) or name.startswith(".") or name == TRUE:
+                raise self.wrong(f"a name in {key}", name, f"letters, digits, spaces and . , + - _, and not {TRUE!r}")
         return list(found.items())
 
     def numbers(self, whole: dict[str, Any], key: str, default: list[float]) -> list[float]:
         found = whole.pop(key, default)
-        if not isinstance(found, list) or not found or not all(isinstance(one, int | float) for one in found):
-            raise self.wrong(key, found, "one number or more")
+        if not isinstance(found, list) or not found or not all(_fits(one, float) and one >= 0 for one in found):
+            raise self.wrong(key, found, "one number or more, none below 0")
         return [float(one) for one in found]
 
     def nothing_left(self, whole: dict[str, Any], name: str) -> str:
@@ -126,26 +145,36 @@ class _Reader:
         for key in values:
             if key not in known:
                 raise BenchmarkError(f"{self.path}: unknown key {place}.{key}, expected among: {', '.join(known)}")
+        hints = get_type_hints(kind)
+        for key, value in values.items():
+            if not _fits(value, hints[key]):
+                choices = get_args(hints[key]) if get_origin(hints[key]) is Literal else ()
+                expected = f"one of {', '.join(map(str, choices))}" if choices else getattr(hints[key], "__name__", "")
+                raise self.wrong(f"{place}.{key}", value, expected or str(hints[key]))
+        converted = {key: _converted(value, hints[key]) for key, value in values.items()}
         try:
-            return kind(**values)
+            return kind(**converted)
         except TypeError as error:
             raise BenchmarkError(f"{self.path}: {place}: {error}") from None
 
     def method(self, content: object, place: str) -> Method:
         method = Method(content) if isinstance(content, str) else self.make(Method, content, place)
-        if method.role not in get_args(Role):
-            raise self.wrong(f"{place}.role", method.role, f"one of {', '.join(get_args(Role))}")
-        if not isinstance(method.command, str) or not method.words:
-            raise self.wrong(f"{place}.command", method.command, "what follows ns-train")
+        try:
+            whole = bool(method.words)
+        except ValueError:
+            whole = False
+        if not whole:
+            raise self.wrong(f"{place}.command", method.command, "what follows ns-train, as a shell would read it")
         return method
 
     def scene(self, content: object, place: str) -> Simulation | Path:
         if isinstance(content, str):
             return Path(content)
         values = self.mapping(content, place)
+        if "errors" in values:
+            raise BenchmarkError(f"{self.path}: {place}.errors: expected under trajectories")
         sensor = self.make(SensorModel, values.pop("sensor", {}), f"{place}.sensor")
-        # What is wrong with the trajectory is a dimension of its own.
-        return self.make(Simulation, {**values, "sensor": sensor, "errors": _NO_ERRORS}, place)
+        return replace(self.make(Simulation, values, place), sensor=sensor, errors=_NO_ERRORS)
 
     def errors(self, content: object, place: str) -> TrajectoryErrors | None:
         if content == "as given":
@@ -153,7 +182,27 @@ class _Reader:
         values = {"position_noise": 0.0, "rotation_noise_rad": 0.0, **self.mapping(content, place)}
         return self.make(TrajectoryErrors, values, place)
 
-    def other(self, content: object, place: str) -> Other:
-        values = self.mapping(content, place)
-        paths = {key: Path(values[key]) for key in ("refined", "renders") if values.get(key)}
-        return self.make(Other, {**values, **paths}, place)
+    def others(self, content: object) -> tuple[Other, ...]:
+        if not isinstance(content, list):
+            raise self.wrong("others", content, "a list")
+        return tuple(self.make(Other, one, f"others[{k}]") for k, one in enumerate(content))
+
+
+def _fits(value: object, kind: Any) -> bool:
+    """Whether a value from YAML is of an annotated type."""
+    if get_origin(kind) in (Union, UnionType):
+        return any(_fits(value, one) for one in get_args(kind))
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if get_origin(kind) is tuple:
+        return isinstance(value, list) and all(_fits(one, get_args(kind)[0]) for one in value)
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if kind is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, str if kind is Path else kind)
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    paths = kind is Path or Path in get_args(kind)
+    return Path(value) if paths and isinstance(value, str) else tuple(value) if isinstance(value, list) else value

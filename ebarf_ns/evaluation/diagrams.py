@@ -37,7 +37,7 @@ _POSITION_TARGETS_M = (0.05, 0.02, 0.01, 0.005)
 
 def write_diagrams(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write the diagrams as SVG and the tables as Markdown; returns their paths."""
-    records = [record for record in result["records"] if record["evaluations"]]
+    records = result["records"]
     written = []
     for figure, name in (
         (_work_precision(records, result["roles"]), "work_precision"),
@@ -62,6 +62,11 @@ def error_of(evaluation: Record, name: str) -> float:
         # Along a line only orientation and scale can be aligned.
         value = evaluation.get("ate_m_orientation")
     return math.inf if value is None else float(value)
+
+
+def _last(record: Record) -> Record:
+    """The last evaluation; of a training that failed, nothing, which is infinitely bad."""
+    return record["evaluations"][-1] if record["evaluations"] else {}
 
 
 def seconds_to(records: Sequence[Record], name: str, target: float) -> float:
@@ -125,9 +130,9 @@ def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
                     # Poses that are given as they are say nothing here.
                     continue
                 _draw_curve(axis, own, name, colours[method], _STYLES[roles.get(method, "method")], method)
-            given = [record["initial"].get(name) or math.nan for record in group if record["trajectory"] == trajectory]
-            if given and not all(map(math.isnan, given)):
-                axis.axhline(float(np.nanmedian(given)), color="grey", lw=1, ls="-.", label="as given")
+            given = [error_of(record["initial"], name) for record in group if record["trajectory"] == trajectory]
+            if math.isfinite(np.median(given)):
+                axis.axhline(float(np.median(given)), color="grey", lw=1, ls="-.", label="as given")
             axis.set(xscale="log", yscale="log", title=f"{scene}, {trajectory}: {title}")
             seconds = sorted({record["seconds"] for record in group})
             axis.set_xticks(seconds, [f"{one:g}" for one in seconds])
@@ -144,7 +149,7 @@ def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
 def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, style: str, label: str) -> None:
     """Where trainings of each length end, median and quartiles of the seeds; faintly, the way of the longest there."""
     ends = {
-        seconds: [error_of(record["evaluations"][-1], name) for record in group]
+        seconds: [error_of(_last(record), name) for record in group]
         for (seconds,), group in sorted(_problems(records, "seconds").items())
     }
     # Without interpolation, which two trainings that failed would not survive.
@@ -158,7 +163,9 @@ def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, s
     seconds = np.array(list(ends))
     axis.plot(seconds[known], middle[known], style, marker="o", ms=4, color=colour, label=label)
     axis.vlines(seconds[known], low[known], np.where(np.isfinite(high), high, middle)[known], color=colour, lw=1.5)
-    longest = [record for record in records if record["seconds"] == seconds.max()]
+    longest = [record for record in records if record["seconds"] == seconds.max() and record["evaluations"]]
+    if not longest:
+        return
     count = min(len(record["evaluations"]) for record in longest)
     way = np.median([[error_of(one, name) for one in record["evaluations"][:count]] for record in longest], axis=0)
     at = np.median([[one["train_seconds"] for one in record["evaluations"][:count]] for record in longest], axis=0)
@@ -195,7 +202,7 @@ def _profiles(records: Sequence[Record]) -> Figure:
 
 def _target(group: Sequence[Record], name: str, tolerance: float) -> float:
     """best + tolerance * (initial - best), the best of any method."""
-    best = min(error_of(one, name) for record in group for one in record["evaluations"])
+    best = min((error_of(one, name) for record in group for one in record["evaluations"]), default=math.inf)
     initial = 1.0 if name == "heldout_event_loss" else error_of(group[0]["initial"], name)
     if not math.isfinite(best):
         return -math.inf
@@ -204,7 +211,7 @@ def _target(group: Sequence[Record], name: str, tolerance: float) -> float:
 
 def tables(result: dict[str, Any]) -> str:
     """How good after each time, and how long to each target, medians over the seeds, as Markdown."""
-    panels = _panels([record for record in result["records"] if record["evaluations"]], result["roles"])
+    panels = _panels(result["records"], result["roles"])
     lines = [f"{result['machine']}, {result['date']}; medians over the seeds", ""]
     lines += _row("scene", "trajectory", "method", "time", "PSNR", "position error", "rotation error", "unexplained")
     lines += ["|---" * 8 + "|"]
@@ -213,8 +220,8 @@ def tables(result: dict[str, Any]) -> str:
         given = (_shown(_median(initial, name), unit) for name, unit in (("ate_m", "m"), ("rotation_deg", "deg")))
         lines += _row(scene, trajectory, "as given", "", "", *given, "")
         for (method, seconds), own in _problems(group, "method", "seconds").items():
-            last = [record["evaluations"][-1] for record in own]
-            psnr = float(np.median([one["psnr"] for one in last])) if all(one.get("psnr") for one in last) else math.inf
+            last = [_last(record) for record in own]
+            psnr = float(np.median([-math.inf if one.get("psnr") is None else one["psnr"] for one in last]))
             errors = (_shown(_median(last, name), unit) for name, unit in (("ate_m", "m"), ("rotation_deg", "deg")))
             unexplained = _shown(_median(last, "heldout_event_loss"), "")
             lines += _row(scene, trajectory, method, f"{seconds:g} s", _shown(psnr, "dB"), *errors, unexplained)

@@ -13,7 +13,7 @@ from ebarf_ns.errors import EvaluationError
 from ebarf_ns.scene import Frame
 
 _DARKEST = 1e-3
-_SMALLEST_FOR_LPIPS = 64
+_SMALLEST_FOR_SSIM, _SMALLEST_FOR_LPIPS = 11, 64
 
 
 def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
@@ -92,7 +92,8 @@ def image_errors(
 ) -> dict[str, float]:
     """Mean PSNR, SSIM and LPIPS of log-brightness renders against linear references, on [0, 1] after the joint fit.
 
-    LPIPS (Zhang et al. 2018, AlexNet) is not among them where :func:`lpips_missing` says why.
+    LPIPS (Zhang et al. 2018, AlexNet) is not among them where :func:`lpips_missing` says why, nor SSIM where a frame is
+    smaller than its window.
     """
     from torchmetrics.functional.image import (
         learned_perceptual_image_patch_similarity,
@@ -106,9 +107,10 @@ def image_errors(
     for fitted, truth in zip(fit_brightness(rendered_log, reference), reference, strict=True):
         ours, theirs = (torch.from_numpy(np.clip(image / white, 0, 1))[None, None].float() for image in (fitted, truth))
         errors["psnr"].append(float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)))
-        similarity = structural_similarity_index_measure(ours, theirs, data_range=1.0)
-        assert isinstance(similarity, torch.Tensor)
-        errors["ssim"].append(float(similarity))
+        if min(truth.shape) >= _SMALLEST_FOR_SSIM:
+            similarity = structural_similarity_index_measure(ours, theirs, data_range=1.0)
+            assert isinstance(similarity, torch.Tensor)
+            errors["ssim"].append(float(similarity))
         if with_lpips:
             ours, theirs = (image.expand(-1, 3, -1, -1) for image in (ours, theirs))
             distance = learned_perceptual_image_patch_similarity(ours, theirs, net_type="alex", normalize=True)

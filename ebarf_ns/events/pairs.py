@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
-_MOST_OVER_MEAN = 20
+_MOST_OVER_USUAL, _ALWAYS_COUNT = 20, 1000
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class EventPairs:
 
 @dataclass(frozen=True)
 class PairIndex:
-    """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over such pairs.
+    """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over such pairs
+    but for those of pixels far busier than usual, which are fewer.
 
     Takes 12 bytes an event and 24 a pixel, in memory or in a file.
     """
@@ -64,7 +65,7 @@ class PairIndex:
     """Pixels, those with the most events first."""
     events_before: Int64[np.ndarray, "pixels+1"]
     """Number of events of all the pixels before each place of ``busiest``; of one pixel, no more count than 20 times
-    what a pixel usually has, lest a hot pixel's millions fill the batches."""
+    what is usual, lest a hot pixel's millions fill the batches."""
 
     @property
     def max_steps(self) -> int:
@@ -170,10 +171,17 @@ def index_pairs(
             _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
         begin = end
     busiest = np.argsort(-counts, kind="stable")
-    # Hot pixels are few; they do not say what is usual.
-    usual = counts[busiest[len(busiest) // 100 + 1 :]]
-    most = max(2, _MOST_OVER_MEAN * int(usual.sum()) // np.count_nonzero(usual)) if usual.any() else total
-    return PairIndex(events, first, busiest, np.r_[0, np.minimum(counts, most)[busiest].cumsum()])
+    falling = counts[busiest]
+    return PairIndex(events, first, busiest, np.r_[0, np.minimum(falling, _most_that_count(falling)).cumsum()])
+
+
+def _most_that_count(falling: np.ndarray) -> int:
+    """20 times what the pixel of a usual event has; hot pixels are few, and do not say what is usual."""
+    others = falling[len(falling) // 1000 + 1 :]
+    if not others.any():
+        return int(falling[0])
+    usual = others[np.searchsorted(others.cumsum(), others.sum() / 2)]
+    return max(_MOST_OVER_USUAL * int(usual), _ALWAYS_COUNT)
 
 
 def _file_backed(count: int) -> np.ndarray:

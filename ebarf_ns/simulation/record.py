@@ -25,7 +25,8 @@ def record(
 
     Between two renders nothing moves further than a third of a pixel, and between two samples of a pixel its log
     brightness changes by no more than a third of a threshold, but for jumps, which are found to a microsecond. Peaks
-    are sampled too. Where the bandwidth is unlimited, the time of each event is then solved for.
+    are sampled too. Then the time of each event is solved for, but for pixels of limited bandwidth or with a refractory
+    period, where it is interpolated between those samples.
     """
     steps = _Steps(view, model, end_us)
     radiance, distance = view.images(np.zeros(1))
@@ -42,7 +43,7 @@ def record(
         until = len(t_us) - (1 if t_us[-1] == end_us else 2)
         if until > seen:
             crossings = sensor.see(*_samples(view, t_us, brightness, seen, until, largest_change))
-            at_us = crossings.t_us if model.cutoff_hz else _sharpened(view, sensor, crossings)
+            at_us = crossings.t_us if model.cutoff_hz or model.refractory_us else _sharpened(view, sensor, crossings)
             chunks.append((crossings.pixel, at_us, crossings.polarity))
             progress(t_us[until] / end_us)
         kept = max(until - 1, 0)
@@ -138,7 +139,8 @@ def _sharpened(view: View, sensor: EventSensor, crossings: Crossings) -> Float[n
     t_us = crossings.t_us.copy()
     below_us, below = crossings.before_us.copy(), crossings.before - crossings.level
     above_us, above = crossings.after_us.copy(), crossings.after - crossings.level
-    (some,) = np.nonzero(above_us - below_us > _FINEST_US)
+    # A threshold that shrinks passes a level that nothing else does.
+    (some,) = np.nonzero((above_us - below_us > _FINEST_US) & (np.sign(below) != np.sign(above)))
     for _ in range(_SHARPENINGS):
         if not len(some):
             break

@@ -69,7 +69,9 @@ class EventSensor:
         self._t_us, self._input, self._output = np.zeros(count), log_brightness.copy(), log_brightness.copy()
         # Switched on long ago: levels lie anywhere within a threshold of the brightness.
         phase = np.random.default_rng(0).uniform(-1, 1, count)
-        self.level = log_brightness + phase * np.where(phase > 0, self.threshold_off, self.threshold_on)
+        self.level = log_brightness + phase * self._growth(0) * np.where(
+            phase > 0, self.threshold_off, self.threshold_on
+        )
         self._blind_until_us = np.full(count, -np.inf)
 
     def leak(self, t_us: Float[np.ndarray, "samples"]) -> Float[np.ndarray, "samples"]:
@@ -85,7 +87,7 @@ class EventSensor:
         """The events up to new samples, which are in order of pixel, then time; ordered likewise."""
         until_us = float(t_us.max())
         noise_pixel, noise_us, noise_polarity = self._noise(float(self._t_us.min()), until_us)
-        growth = 1 + self.model.threshold_drift * (until_us / self.end_us - 0.5)
+        growth = self._growth(until_us)
         columns = _observe(
             pixel, t_us, log_brightness + self.leak(t_us),
             self._t_us, self._input, self._output, self.level, self._blind_until_us,
@@ -94,6 +96,9 @@ class EventSensor:
             noise_pixel, noise_us, noise_polarity,
         )  # fmt: skip
         return Crossings(*columns)
+
+    def _growth(self, t_us: float) -> float:
+        return 1 + self.model.threshold_drift * (t_us / self.end_us - 0.5)
 
     def jitter(self, t_us: Float[np.ndarray, "events"]) -> Int64[np.ndarray, "events"]:
         """Timestamps as the sensor gives them."""

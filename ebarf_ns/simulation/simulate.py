@@ -112,6 +112,8 @@ def _check(settings: Simulation) -> int:
             raise SimulationError(f"{name} is {value}, expected 0 or more")
     if abs(settings.sensor.threshold_drift) > 1:
         raise SimulationError(f"threshold_drift is {settings.sensor.threshold_drift}, expected -1 to 1")
+    if settings.seed < 0 or settings.frames < 0:
+        raise SimulationError(f"seed is {settings.seed} and frames {settings.frames}, expected 0 or more")
     if not 0 <= settings.exposure_ms < _LARGEST:
         raise SimulationError(f"exposure_ms is {settings.exposure_ms}, expected 0 or more")
     if len(settings.distortion) not in COEFFICIENTS[settings.lens]:

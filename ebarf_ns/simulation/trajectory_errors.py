@@ -1,5 +1,6 @@
 """What odometry gets wrong: the ways in which an initial trajectory differs from the true one."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,11 +41,16 @@ def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Traj
 
     Raises :class:`SimulationError` for errors that leave no trajectory.
     """
-    if not 0 <= errors.dropped < 1:
+    for name, value in vars(errors).items():
+        if not math.isfinite(value) or (value < 0 and name != "clock_offset_us"):
+            raise SimulationError(f"{name} is {value}, expected 0 or more")
+    if errors.dropped >= 1:
         raise SimulationError(f"dropped is {errors.dropped}, expected a share from 0 to below 1")
     if not errors.scale > 0:
         raise SimulationError(f"scale is {errors.scale}, expected a value above 0")
     count = len(trajectory.t_us)
+    if count < 2 or seed < 0:
+        raise SimulationError(f"{count} keyframes and seed {seed}, expected 2 keyframes or more, and a seed from 0 on")
     noise = _random(seed, 99).standard_normal((count, 6)) * _sizes(errors.position_noise, errors.rotation_noise_rad)
     noise += _drift(count, seed) * _sizes(errors.position_drift, errors.rotation_drift_rad)
     noise += _wander(trajectory, errors.wander_s, seed) * _sizes(errors.position_wander, errors.rotation_wander_rad)

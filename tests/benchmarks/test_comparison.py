@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ebarf_ns.scene import read_scene
+from ebarf_ns.scene import Scene, read_scene
 from tests.conftest import run_command, run_ok
 
 MANIFEST = """
@@ -22,7 +22,7 @@ scenes:
   tiny: {scene: orbit, width: 24, height: 18, focal_px: 20.0, duration_s: 0.3, frames: 2}
 trajectories:
   white: {position_noise: 0.03, rotation_noise_rad: 0.03}
-  drift: {position_drift: 0.05}
+  drift: {position_drift: 0.05, scale: 2.0}
 seeds: [0]
 seconds: [1.5]
 evaluations: 2
@@ -53,10 +53,18 @@ def test_every_job_has_a_record_with_its_cost(comparison: Path):
     assert records["ebarf", "drift"]["initial"]["ate_m"] != records["ebarf", "white"]["initial"]["ate_m"]
 
 
+def made(comparison: Path, trajectory: str) -> Scene:
+    (folder,) = (comparison / "out" / "scenes").glob(f"tiny-0-{trajectory}-*")
+    return read_scene(folder)
+
+
 def test_scenes_of_one_seed_share_their_events(comparison: Path):
-    white, drift = (comparison / "out" / "scenes" / f"tiny-0-{name}" for name in ("white", "drift"))
-    assert (white / "events.h5").samefile(drift / "events.h5")
-    assert (white / "trajectory.txt").read_text() != (drift / "trajectory.txt").read_text()
+    white, drift = made(comparison, "white"), made(comparison, "drift")
+    assert white.events == drift.events and white.events.is_file()
+    assert white.trajectory.read_text() != drift.trajectory.read_text()
+    # A trajectory in another unit is that of a scene in another unit.
+    lower, upper = np.array(drift.bounds), np.array(white.bounds)
+    assert np.allclose(lower, 2 * upper)
 
 
 def test_diagrams_and_tables_show_every_method(comparison: Path):
@@ -72,7 +80,7 @@ def test_diagrams_and_tables_show_every_method(comparison: Path):
 def test_a_stopped_comparison_goes_on_where_it_stopped(comparison: Path):
     out = comparison / "out"
     before = {path: path.stat().st_mtime_ns for path in (out / "results").glob("*.json")}
-    removed = next(path for path in before if "-ebarf" in path.name)
+    removed = next(path for path in before if "-ebarf-" in path.name)
     removed.unlink()
     result = json.loads(run_ok("ebarf", "bench", comparison / "mini.yaml", "--output", out, "--json", timeout_s=600))
     assert len(result["records"]) == 5
@@ -81,7 +89,7 @@ def test_a_stopped_comparison_goes_on_where_it_stopped(comparison: Path):
 
 
 def test_another_program_joins_by_its_files(comparison: Path, tmp_path: Path):
-    scene = read_scene(comparison / "out" / "scenes" / "tiny-0")
+    scene = made(comparison, "white")
     assert scene.groundtruth
     shutil.copy(scene.groundtruth, tmp_path / "theirs.txt")
     (tmp_path / "pictures").mkdir()

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from ebarf_ns.benchmarks.comparison import TRUE, jobs
-from ebarf_ns.benchmarks.manifest import read_manifest
+from ebarf_ns.benchmarks.comparison import jobs
+from ebarf_ns.benchmarks.manifest import TRUE, read_manifest
 from ebarf_ns.errors import BenchmarkError
 from ebarf_ns.simulation.simulate import Simulation
 from tests.conftest import REPOSITORY
@@ -27,6 +27,8 @@ others:
 
 
 def read(tmp_path: Path, text: str):
+    (tmp_path / "theirs.txt").touch()
+    text = text.replace("theirs.txt", str(tmp_path / "theirs.txt"))
     path = tmp_path / "some.yaml"
     path.write_text(text)
     return read_manifest(path)
@@ -38,7 +40,7 @@ def test_a_manifest_says_what_is_compared(tmp_path: Path):
     assert manifest.methods["floor"].words[1:] == ["--pipeline.model.camera-optimizer.mode", "off"]
     room = manifest.scenes["room"]
     assert isinstance(room, Simulation) and room.scene == "orbit" and room.sensor.leak_hz == 0.1
-    assert manifest.scenes["slide"] == Path("some/folder") and manifest.others[0].refined == Path("theirs.txt")
+    assert manifest.scenes["slide"] == Path("some/folder") and manifest.others[0].refined == tmp_path / "theirs.txt"
     white = manifest.trajectories["white"]
     assert (
         white and white.position_noise == 0.03 and white.rotation_noise_rad == 0 and not manifest.trajectories["given"]
@@ -49,7 +51,10 @@ def test_floors_are_trained_once_whatever_the_trajectory(tmp_path: Path):
     found = jobs(read(tmp_path, WHOLE))
     assert len(found) == len(set(found)) == 2 * 2 * 2 * (2 + 1)
     assert {job.trajectory for job in found if job.method == "floor"} == {TRUE}
-    assert len({job.name for job in found}) == len(found) and all("/" not in job.name for job in found)
+    names = {job.name("this") for job in found}
+    assert len(names) == len(found) and all("/" not in name for name in names)
+    # What is made of something else has another name: its result is not taken for this one's.
+    assert found[0].name("this") != found[0].name("that")
 
 
 @pytest.mark.parametrize(
@@ -77,6 +82,15 @@ def test_shipped_manifests_are_whole(path: Path):
         (WHOLE.replace("[5, 10]", "[5, fast]"), "seconds is .5, 'fast'."),
         (WHOLE.replace("evaluations: 3", "evaluations: many"), "evaluations is .'many'."),
         (WHOLE.replace(", refined: theirs.txt", ""), "others.0.: .*refined"),
+        (WHOLE.replace("theirs.txt", "nothing.txt"), "names nothing.txt, but there is no such file"),
+        (WHOLE.replace("theirs, scene: room", "theirs, scene: hall"), "of scene 'hall'"),
+        (WHOLE.replace("0.03}", "1e-2}"), "trajectories.white.position_noise is '1e-2', expected float"),
+        (WHOLE.replace("scene: orbit", "scene: nope"), "scenes.room.scene is 'nope'"),
+        (WHOLE.replace("frames: 2", "frames: 2, errors: {}"), "scenes.room.errors: expected under trajectories"),
+        (WHOLE.replace("mode off", "mode 'off"), "methods.floor.command"),
+        (WHOLE.replace("[0, 4]", "[-1]"), "seeds is .-1., expected one number or more, none below 0"),
+        (WHOLE.replace("  white:", "  'true':"), "a name in trajectories is 'true'"),
+        (WHOLE.replace("  slide:", "  ../slide:"), "a name in scenes is '../slide'"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, complaint: str):

@@ -129,3 +129,7 @@ def test_lpips_is_computed_where_the_weights_are(tmp_path: Path, monkeypatch: py
     large = np.kron(picture(), np.ones((4, 4)))
     same, other = (image_errors([np.log(render)], [large])["lpips"] for render in (large, large[:, ::-1]))
     assert same < 1e-3 < other
+
+
+def test_frames_smaller_than_a_window_have_no_ssim():
+    assert set(image_errors([np.log(picture()[:5, :5])], [picture()[:5, :5]])) == {"psnr"}

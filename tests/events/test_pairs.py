@@ -174,3 +174,13 @@ def test_no_room_for_the_file_of_an_index_is_said(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("os.posix_fallocate", full)
     with pytest.raises(RecordingError, match="no room for an index of .*TMPDIR"):
         index_of(recording(0, 300), memory_bytes=16)
+
+
+def test_edges_that_have_nearly_all_events_count_in_full():
+    random = np.random.default_rng(0)
+    pixel = np.r_[np.repeat(np.arange(180), 1000), np.arange(180, 20_000)]
+    pixel = pixel[random.permutation(len(pixel))]
+    t_us = np.sort(random.integers(0, 10**6, len(pixel)))
+    x, y = (pixel % 200).astype(np.uint16), (pixel // 200).astype(np.uint16)
+    index = index_pairs(lambda: [Recording(x, y, t_us, np.ones(len(pixel), np.int8))], 200, 100)
+    assert index.max_steps == 999 and index.events_before[-1] == len(pixel)

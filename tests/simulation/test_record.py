@@ -111,3 +111,21 @@ def test_leaking_pixels_are_still_exact():
     change = np.diff(Stripes().log_radiance(0.5 / 80 + 0.5e-6 * times) + 0.2e-6 * times)
     polarity = events.polarity[index & (events.y == 0)][1:]
     assert np.allclose(change, np.where(polarity > 0, 0.2, -0.3), atol=5e-5)
+
+
+@pytest.mark.parametrize("drift", [-1.0, 1.0])
+def test_drifting_thresholds_leave_the_order_of_a_pixels_events(drift: float):
+    model = replace(SENSOR, threshold_drift=drift)
+    events, steady = record(view_of(), model, END_US, 0), record(view_of(), SENSOR, END_US, 0)
+    assert len(events) == pytest.approx(len(steady), rel=0.3)
+    for x in range(0, 60, 7):
+        mine = (events.x == x) & (events.y == 0)
+        # Between its extremes a sinusoid goes one way, and so do its events: a run of one polarity, then of the other.
+        runs = 1 + np.count_nonzero(np.diff(events.polarity[mine]))
+        assert runs <= 10
+
+
+def test_a_pixel_is_never_early_after_an_event():
+    events = record(view_of(speed_m_s=5.0), replace(SENSOR, refractory_us=2000.0), END_US, 0)
+    gaps = [np.diff(events.t_us[(events.x == x) & (events.y == 1)]).min() for x in range(60)]
+    assert min(gaps) >= 1999

@@ -110,3 +110,9 @@ def test_timestamps_jitter_by_what_was_asked_for_and_stay_within_the_recording()
     jittered = sensor.jitter(t_us)
     assert jittered.dtype == np.int64 and jittered.min() >= 0 and jittered.max() <= 1_000_000
     assert (jittered - t_us)[100:-100].std() == pytest.approx(30, rel=0.05)
+
+
+def test_thresholds_that_drift_make_no_events_of_still_light():
+    still = np.full((200, 2000), -1.0)
+    grows = watch(still, np.arange(200) * 5_000.0, replace(CLEAN, threshold_drift=1.0))
+    assert len(grows.pixel) == 0

@@ -140,6 +140,7 @@ def test_a_lens_bends_what_it_shows(tmp_path: Path):
         {"focal_px": -1.0},
         {"keyframe_rate_hz": float("nan")},
         {"exposure_ms": -1.0},
+        {"seed": -1},
         {"lens": "radtan"},
         {"sensor": SensorModel(threshold_on=0.0)},
         {"sensor": SensorModel(refractory_us=-5.0)},

@@ -55,7 +55,17 @@ def test_scale_clock_and_gaps():
     assert torch.allclose(noisy.poses.position, 2 * TRUE.poses.position[kept])
 
 
-@pytest.mark.parametrize("wrong", [{"dropped": 1.0}, {"dropped": -0.1}, {"scale": 0.0}, {"scale": float("nan")}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"dropped": 1.0}, {"dropped": -0.1}, {"scale": 0.0}, {"scale": float("nan")}, {"position_noise": float("nan")}],
+)
 def test_errors_that_leave_no_trajectory_are_refused(wrong: dict):
     with pytest.raises(SimulationError, match=next(iter(wrong))):
         perturb(TRUE, TrajectoryErrors(**wrong), seed=0)
+
+
+def test_negative_seeds_and_single_keyframes_are_refused():
+    with pytest.raises(SimulationError, match="seed -1"):
+        perturb(TRUE, TrajectoryErrors(), seed=-1)
+    with pytest.raises(SimulationError, match="1 keyframes"):
+        perturb(sample_trajectory(HandheldMotion(), np.zeros(1, np.int64)), TrajectoryErrors(), seed=0)

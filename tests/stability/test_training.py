@@ -30,10 +30,10 @@ from tests.conftest import REPOSITORY
 from tests.nerf.test_training import config, same, state, trainer
 
 KILLS = 50
-STEPS = 40
+STEPS, RAYS = 80, 1024
 UNITS_AGREE = 0.15
 FAR_AGREES = 0.25
-NOTHING_LEARNED = 0.7
+LEARNED, SOMETHING_LEARNED, NOTHING_LEARNED = 0.5, 0.95, 0.5
 LOST_DEG = 10.0
 SMALL = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.4, frames=2)
 
@@ -217,6 +217,7 @@ def variant(
 def trained(scene: Path, output: Path, **model: object) -> dict:
     """The last evaluation of a short training of what users get, all of whose numbers must be finite or null."""
     made = config(scene, output, steps=STEPS)
+    made.pipeline.datamanager.train_num_rays_per_batch = RAYS  # pyright: ignore[reportAttributeAccessIssue]
     for name, value in model.items():
         setattr(made.pipeline.model, name, value)
     ready = trainer(made)
@@ -241,19 +242,19 @@ def resampled(t_us: torch.Tensor) -> Callable[[Trajectory], Trajectory]:
 def test_keyframes_a_microsecond_apart(small_scene: Path, tmp_path: Path):
     t_us = torch.tensor([0, 100_000, 100_001, 200_000, 200_001, 200_002, 400_000])
     last = trained(variant(small_scene, tmp_path / "scene", trajectory=resampled(t_us)), tmp_path)
-    assert last["heldout_event_loss"] < 1
+    assert last["heldout_event_loss"] < LEARNED
 
 
 def test_ten_thousand_keyframes(small_scene: Path, tmp_path: Path):
     t_us = torch.arange(10_000) * 40
     last = trained(variant(small_scene, tmp_path / "scene", trajectory=resampled(t_us)), tmp_path)
-    assert last["heldout_event_loss"] < 1 and last["rotation_deg"] < LOST_DEG
+    assert last["heldout_event_loss"] < LEARNED and last["rotation_deg"] < LOST_DEG
 
 
 def test_one_keyframe_interval_holds_all_events(small_scene: Path, tmp_path: Path):
     last = trained(variant(small_scene, tmp_path / "scene", trajectory=resampled(torch.tensor([0, 400_000]))), tmp_path)
     # Two poses cannot be aligned: no number is better than a wrong one.
-    assert last["ate_m"] is None and last["heldout_event_loss"] < 1
+    assert last["ate_m"] is None and last["heldout_event_loss"] < LEARNED
 
 
 @pytest.mark.parametrize("threshold", [0.01, 2.0])
@@ -261,13 +262,13 @@ def test_thresholds_far_from_usual(tmp_path: Path, threshold: float):
     duration_s = 0.1 if threshold < 0.1 else 2.0
     sensor = SensorModel(threshold_on=threshold, threshold_off=threshold)
     simulate(replace(SMALL, sensor=sensor, duration_s=duration_s), tmp_path / "scene")
-    assert trained(tmp_path / "scene", tmp_path)["heldout_event_loss"] <= 1.001
+    assert trained(tmp_path / "scene", tmp_path)["heldout_event_loss"] < SOMETHING_LEARNED
 
 
 def test_radiance_over_six_decades(tmp_path: Path):
     room = Room(window=(-1.2, -0.4, 0.6, 1.0), daylight=1e6)
     scene = simulate(SMALL, tmp_path / "scene", place=Place(room, HandheldMotion()))
-    assert trained(scene.folder, tmp_path)["heldout_event_loss"] < 1
+    assert trained(scene.folder, tmp_path)["heldout_event_loss"] < SOMETHING_LEARNED
 
 
 def test_a_hot_pixel_with_a_million_events(small_scene: Path, tmp_path: Path):
@@ -289,7 +290,7 @@ def test_all_polarities_equal(small_scene: Path, tmp_path: Path):
         return replace(given, polarity=np.ones_like(given.polarity))
 
     last = trained(variant(small_scene, tmp_path / "scene", events=brighter), tmp_path)
-    assert last["heldout_event_loss"] <= 1.001 and last["implied_threshold_off"] is None
+    assert last["heldout_event_loss"] < LEARNED and last["implied_threshold_off"] is None
 
 
 def test_pure_rotation(tmp_path: Path):
@@ -297,7 +298,7 @@ def test_pure_rotation(tmp_path: Path):
     scene = simulate(SMALL, tmp_path / "scene", place=Place(Room(), motion))
     last = trained(scene.folder, tmp_path)
     # There is no path whose scale could be aligned; rotations still are.
-    assert last["ate_m"] is None and last["scale"] is None and last["heldout_event_loss"] < 1
+    assert last["ate_m"] is None and last["scale"] is None and last["heldout_event_loss"] < LEARNED
 
 
 def test_no_motion(small_scene: Path, tmp_path: Path):
