@@ -119,7 +119,7 @@ def _page(header: dict[str, Any], evaluations: list[dict[str, Any]], report: Pat
     return f"""<!doctype html><meta charset="utf-8"><title>{html.escape(report.parent.name)}</title>
 <style>body{{font:14px sans-serif;max-width:70rem;margin:2rem auto}}svg{{max-width:100%;height:auto}}
 td,th{{padding:.1rem .6rem;text-align:right}}.text{{text-align:left}}figure{{display:inline-block;margin:.3rem}}
-img{{width:24rem;image-rendering:pixelated}}</style>
+img{{width:24rem;image-rendering:pixelated}}table{{display:block;overflow-x:auto}}</style>
 <h1>{html.escape(str(header.get("method", "run")))}</h1><p>{facts}</p>
 <h2>Trajectory</h2><p>Aligned to the reference where there is one (by orientation and scale).</p>{svgs}
 <h2>Evaluations</h2><table><tr>{"".join(f"<th>{html.escape(key)}</th>" for key in columns)}</tr>{rows}</table>
