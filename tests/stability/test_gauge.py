@@ -46,7 +46,9 @@ def test_case_30_where_alignment_is_not_defined_there_is_no_number(alignment: st
     truth = wandering()
     line = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([[1.0, 2.0, 3.0]]).double()
     still = torch.zeros(30, 3, dtype=torch.float64)
-    for position in (line, still):
+    # What evo would align about the noise across it.
+    nearly = line + 1e-3 * torch.randn(30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for position in (line, still, nearly):
         degenerate = Trajectory(truth.t_us, Poses(position, truth.poses.quat_wxyz))
         with pytest.raises(EvaluationError):
             trajectory_error(degenerate, degenerate, alignment)  # pyright: ignore[reportArgumentType]

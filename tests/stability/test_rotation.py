@@ -97,7 +97,9 @@ def test_case_02_series_and_formula_meet_without_a_step(dtype: torch.dtype, angl
 
 
 @DTYPES
-@pytest.mark.parametrize("turn_rad", [math.pi - gap for gap in (1e-2, 1e-4, 1e-7, 1e-10, 0.0)] + [2 * math.pi - 1e-11])
+@pytest.mark.parametrize(
+    "turn_rad", [math.pi - gap for gap in (1e-2, 1e-4, 1e-7, 1e-10, 0.0)] + [4.0, 2 * math.pi - 1e-11]
+)
 def test_case_03_log_comes_back_from_half_a_turn_and_from_a_whole_one(dtype: torch.dtype, turn_rad: float):
     turn = (turn_rad * AXIS).to(dtype).requires_grad_()
     back = quat_wxyz_log(quat_wxyz_exp(turn))
