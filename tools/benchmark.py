@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ebarf_ns.benchmarks.engine import machine
+from ebarf_ns.benchmarks.training import train as train_in_process
 
 COLUMNS = {
     "heldout_event_loss": "unexplained events",
@@ -34,13 +35,8 @@ def run(*words: object) -> None:
 
 def train(method: str, scene: Path, seconds: float, seed: int, folder: Path) -> dict[str, Any]:
     """One training; its last evaluation, and the initial trajectory's errors."""
-    run(
-        "ns-train", method, "--data", scene, "--output-dir", folder, "--experiment-name", f"{method}-{seed}",
-        "--timestamp", "run", "--machine.seed", seed, "--max-train-seconds", seconds, "--max-num-iterations", 10**7,
-        "--vis", "tensorboard", "--logging.local-writer.enable", "False",
-    )  # fmt: skip
-    lines = (folder / f"{method}-{seed}" / method / "run" / "metrics.jsonl").read_text().splitlines()
-    return {"method": method, "seed": seed, "seconds": seconds, **json.loads(lines[-1])}
+    evaluations = train_in_process([method], scene, folder / f"{method}-{seed}" / method / "run", seed, seconds, 8)
+    return {"method": method, "seed": seed, "seconds": seconds, **evaluations[-1]}
 
 
 def table(records: list[dict[str, Any]]) -> str:

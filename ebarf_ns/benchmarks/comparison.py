@@ -21,9 +21,7 @@ from ebarf_ns.geometry.trajectory import Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.scene import Scene, read_scene, write_scene
 from ebarf_ns.simulation.simulate import simulate
-from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
-
-_TRUE_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
+from ebarf_ns.simulation.trajectory_errors import NO_ERRORS, perturb
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> Path:
         source = folder / "scenes" / _named(f"{job.scene}-{job.seed}", simulation)
         if not (source / "scene.json").is_file():
             simulate(simulation, source)
-    errors = _TRUE_ERRORS if job.trajectory == TRUE else manifest.trajectories[job.trajectory]
+    errors = NO_ERRORS if job.trajectory == TRUE else manifest.trajectories[job.trajectory]
     if errors is None:
         return source
     scene = read_scene(source)

@@ -14,13 +14,12 @@ import yaml
 from ebarf_ns.errors import BenchmarkError
 from ebarf_ns.simulation.sensor import SensorModel
 from ebarf_ns.simulation.simulate import Simulation
-from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors
+from ebarf_ns.simulation.trajectory_errors import NO_ERRORS, TrajectoryErrors
 
 Role = Literal["method", "floor", "ceiling"]
 T = TypeVar("T")
 TRUE = "true"
 """The trajectory that floors get."""
-_NO_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
 
 
 @dataclass(frozen=True)
@@ -174,12 +173,12 @@ class _Reader:
         if "errors" in values:
             raise BenchmarkError(f"{self.path}: {place}.errors: expected under trajectories")
         sensor = self.make(SensorModel, values.pop("sensor", {}), f"{place}.sensor")
-        return replace(self.make(Simulation, values, place), sensor=sensor, errors=_NO_ERRORS)
+        return replace(self.make(Simulation, values, place), sensor=sensor, errors=NO_ERRORS)
 
     def errors(self, content: object, place: str) -> TrajectoryErrors | None:
         if content == "as given":
             return None
-        values = {"position_noise": 0.0, "rotation_noise_rad": 0.0, **self.mapping(content, place)}
+        values = {**vars(NO_ERRORS), **self.mapping(content, place)}
         return self.make(TrajectoryErrors, values, place)
 
     def others(self, content: object) -> tuple[Other, ...]:

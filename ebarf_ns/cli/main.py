@@ -130,7 +130,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Print the last evaluation and where the report is."""
-        from ebarf_ns.evaluation.frames import lpips_missing
+        from ebarf_ns.evaluation.frames import lpips_note
         from ebarf_ns.evaluation.report import read_metrics, write_report
         from ebarf_ns.scene import read_scene
 
@@ -141,7 +141,7 @@ class Evaluate:
             _stderr.print(f"the run's scene is gone, so the report has no reference trajectory ({error})")
             groundtruth = None
         page = write_report(self.run_folder, groundtruth)
-        if "psnr" in evaluations[-1] and evaluations[-1].get("lpips") is None and (missing := lpips_missing()):
+        if missing := lpips_note(evaluations[-1]):
             _stderr.print(missing, soft_wrap=True)
         if self.json:
             _print_json({**evaluations[-1], "method": header.get("method"), "report": str(page)})

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -116,6 +117,11 @@ def image_errors(
             distance = learned_perceptual_image_patch_similarity(ours, theirs, net_type="alex", normalize=True)
             errors["lpips"].append(float(distance))
     return {name: float(np.mean(values)) for name, values in errors.items() if values}
+
+
+def lpips_note(evaluation: dict[str, Any]) -> str | None:
+    """The same of an evaluation on record; None where it has LPIPS, or no frames at all."""
+    return lpips_missing() if "psnr" in evaluation and evaluation.get("lpips") is None else None
 
 
 def lpips_missing(reference: Sequence[Float[np.ndarray, "height width"]] = ()) -> str | None:

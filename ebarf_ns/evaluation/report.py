@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from ebarf_ns.errors import EvaluationError
-from ebarf_ns.evaluation.frames import lpips_missing
+from ebarf_ns.evaluation.frames import lpips_note
 from ebarf_ns.evaluation.trajectory_error import aligned_positions
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum
@@ -100,7 +100,7 @@ def _curves_figure(evaluations: list[dict[str, Any]]) -> Figure:
 
 
 def _page(header: dict[str, Any], evaluations: list[dict[str, Any]], report: Path, renders: list[Path]) -> str:
-    missing = lpips_missing() if "psnr" in evaluations[-1] and evaluations[-1].get("lpips") is None else None
+    missing = lpips_note(evaluations[-1])
     columns = [key for key in evaluations[-1] if any(record.get(key) is not None for record in evaluations)]
     rows = "".join(
         "<tr>" + "".join(f"<td>{_cell(record.get(key))}</td>" for key in columns) + "</tr>" for record in evaluations

@@ -36,6 +36,10 @@ class TrajectoryErrors:
     """Share of the keyframes that is missing; the first and the last one stay."""
 
 
+NO_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
+"""The true trajectory."""
+
+
 def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Trajectory:
     """A trajectory with errors; rotations and shifts are applied in each keyframe's own frame.
 
