@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ebarf_ns.errors import EvaluationError
 from ebarf_ns.evaluation.frames import image_errors, read_frame, read_pixels
-from ebarf_ns.evaluation.trajectory_error import Alignment, trajectory_error
+from ebarf_ns.evaluation.trajectory_error import trajectory_results
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.scene import Scene
 
@@ -22,13 +22,7 @@ def evaluate_files(scene: Scene, refined: Path, renders: Path | None) -> dict[st
     """
     results: dict[str, Any] = {}
     if scene.groundtruth:
-        alignments: dict[Alignment, str] = {"sim3": "", "orientation": "_orientation"}
-        for alignment, suffix in alignments.items():
-            try:
-                error = trajectory_error(read_tum(refined), read_tum(scene.groundtruth), alignment)
-            except EvaluationError:
-                continue
-            results |= {f"ate_m{suffix}": error.ate_m, "rotation_deg": error.rotation_deg}
+        results |= trajectory_results(read_tum(refined), read_tum(scene.groundtruth))
     if renders:
         rendered = [_log_brightness(_find(renders, frame.path.stem)) for frame in scene.frames]
         references = [read_frame(frame) for frame in scene.frames]

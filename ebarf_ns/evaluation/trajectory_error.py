@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,12 +16,14 @@ from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError
 from ebarf_ns.geometry.so3 import quat_wxyz_multiply, rotate
-from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 
 # Motion across the main direction below this share of that along it counts as a line.
 _THINNEST = 0.01
 Alignment = Literal["se3", "sim3", "orientation"]
+_SUFFIXES: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
+"""How results say which alignment a number is of."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     where the alignment is not defined: fewer than 3 poses, no motion, or for Umeyama's a line.
     """
     estimated, true = _matched(estimate, reference)
-    turned, straight = (Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3]) for path in (estimated, true))
+    turned, straight = _rotations(estimated), _rotations(true)
     if alignment == "orientation":
         scale = _align_by_orientation(estimated, true, (straight * turned.inv()).mean())
     else:
@@ -104,6 +106,18 @@ def _align_by_orientation(estimated: PosePath3D, true: PosePath3D, world: Rotati
     return scale
 
 
+def _rotations(path: PosePath3D) -> Rotation:
+    return Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3])
+
+
+def _rotations_alone_deg(estimate: Trajectory, reference: Trajectory) -> float | None:
+    try:
+        estimated, true = _matched(estimate, reference)
+    except EvaluationError:
+        return None
+    return _rotation_error_deg(_rotations(estimated), _rotations(true), iterations=0)
+
+
 def _rotation_error_deg(estimate: Rotation, true: Rotation, iterations: int) -> float:
     """RMSE of true = world * estimate * body with the best world rotation, and by alternation the best body one."""
     body = Rotation.identity()
@@ -140,11 +154,23 @@ def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.n
     """The estimate's positions aligned by orientation and scale, for plots; as they are where that is not defined."""
     try:
         estimated, true = _matched(estimate, reference)
-        turned, straight = (Rotation.from_matrix([p[:3, :3] for p in path.poses_se3]) for path in (estimated, true))
-        _align_by_orientation(estimated, true, (straight * turned.inv()).mean())
+        _align_by_orientation(estimated, true, (_rotations(true) * _rotations(estimated).inv()).mean())
     except EvaluationError:
         return estimate.poses.position.double().numpy()
     return np.asarray(estimated.positions_xyz)
+
+
+def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
+    """What results say of a trajectory: its errors under each alignment, None where one is not defined.
+
+    Rotations have an error wherever 3 poses match, also about a camera that stays where it is.
+    """
+    errors, _ = _under_each_alignment(estimate, reference)
+    results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": _rotations_alone_deg(estimate, reference)}
+    for alignment, suffix in _SUFFIXES.items():
+        error = errors.get(alignment)
+        results |= {f"ate_m{suffix}": error and error.ate_m, f"scale{suffix}": error and error.scale}
+    return {**results, "ape_full": errors["se3"].ape_full if "se3" in errors else None}
 
 
 def compare_files(estimate: Path, reference: Path) -> dict[str, Any]:
@@ -152,31 +178,43 @@ def compare_files(estimate: Path, reference: Path) -> dict[str, Any]:
 
     Raises :class:`EvaluationError` where none is.
     """
-    estimated, true = read_tum(estimate), read_tum(reference)
-    comparison: dict[str, Any] = {}
-    reasons = []
-    for alignment in get_args(Alignment):
-        try:
-            error = trajectory_error(estimated, true, alignment)
-        except EvaluationError as problem:
-            comparison[alignment] = None
-            reasons.append(f"{alignment}: {problem}")
-            continue
-        numbers = vars(error).copy()
-        comparison |= {"matched": numbers.pop("matched")}
-        comparison[alignment] = numbers
-    if not any(comparison.values()):
-        raise EvaluationError(f"{estimate}: {reasons[0]}")
+    errors, reasons = _under_each_alignment(read_tum(estimate), read_tum(reference))
+    if not errors:
+        raise EvaluationError(f"{estimate}: {next(iter(reasons.values()))}")
+    comparison: dict[str, Any] = {alignment: None for alignment in _SUFFIXES}
+    for alignment, error in errors.items():
+        comparison[alignment] = vars(error).copy()
+        comparison["matched"] = comparison[alignment].pop("matched")
     notes = [f"{path.name}: seconds, quaternions x y z w, as TUM has them" for path in (estimate, reference)]
-    sim3 = comparison["sim3"]
-    return {**comparison, "scale": sim3 and sim3["scale"], "notes": notes + reasons}
+    notes += [f"{alignment}: {reason}" for alignment, reason in reasons.items()]
+    return {**comparison, "scale": errors["sim3"].scale if "sim3" in errors else None, "notes": notes}
+
+
+def _under_each_alignment(
+    estimate: Trajectory, reference: Trajectory
+) -> tuple[dict[Alignment, TrajectoryError], dict[Alignment, str]]:
+    """The errors where an alignment is defined, and where it is not the reason."""
+    errors, reasons = {}, {}
+    for alignment in _SUFFIXES:
+        try:
+            errors[alignment] = trajectory_error(estimate, reference, alignment)
+        except EvaluationError as problem:
+            reasons[alignment] = str(problem)
+    return errors, reasons
 
 
 def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_us: Int64[Tensor, "times"]) -> Poses:
     """The reference's poses at ``t_us``, moved into the estimate's world by the inverse of the sim3 alignment.
 
-    For frames outside the estimate's span. Raises :class:`EvaluationError` where the alignment is not defined.
+    For frames outside the estimate's span. Raises :class:`EvaluationError` where the alignment is not defined, and for
+    times outside the reference's span.
     """
+    outside = t_us[~within_span(t_us, reference.t_us)]
+    if len(outside):
+        raise EvaluationError(
+            f"no reference pose at {int(outside[0])} us, expected a time from {int(reference.t_us[0])} to "
+            f"{int(reference.t_us[-1])} us, the reference's span"
+        )
     estimated, true = _matched(estimate, reference)
     rotation, shift, scale = _umeyama(estimated, true, correct_scale=True)
     poses = interpolate(reference.t_us, reference.poses, t_us)

@@ -15,13 +15,9 @@ from torch import Tensor
 from ebarf_ns.errors import EvaluationError, one_line_errors
 from ebarf_ns.evaluation.frames import depth_error, fit_brightness, image_errors, read_depth, read_frame
 from ebarf_ns.evaluation.heldout import implied_thresholds, unexplained_share
-from ebarf_ns.evaluation.trajectory_error import (
-    Alignment,
-    reference_in_estimates_world,
-    trajectory_error,
-)
+from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world, trajectory_results
 from ebarf_ns.files import whole_file
-from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras
@@ -32,9 +28,6 @@ from ebarf_ns.scene import Frame, Scene
 # nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
 warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True to a scalar")
-
-_ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
-"""How refined and reference trajectory are aligned, and the suffix that says so in the results."""
 
 
 @dataclass
@@ -150,8 +143,6 @@ class EbarfPipeline(VanillaPipeline):
             return None
         reference = read_tum(self.scene.groundtruth)
         t_us = torch.tensor([frame.t_us for frame in frames])
-        if not within_span(t_us, reference.t_us).all():
-            return None
         try:
             poses = reference_in_estimates_world(self.trajectory(), reference, t_us)
         except EvaluationError:
@@ -193,22 +184,8 @@ class EbarfPipeline(VanillaPipeline):
         """Errors under each alignment, and the scale that takes the trajectory's unit to the reference's."""
         if self.scene.groundtruth is None:
             return {}, None
-        reference, estimate = read_tum(self.scene.groundtruth), self.trajectory()
-        results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": None, "scale": None, "ape_full": None}
-        scales = {}
-        for alignment, suffix in _ALIGNMENTS.items():
-            try:
-                error = trajectory_error(estimate, reference, alignment)
-            except EvaluationError:
-                # Where no alignment is defined there is no number.
-                results |= {f"ate_m{suffix}": None}
-                continue
-            results |= {f"ate_m{suffix}": error.ate_m, "rotation_deg": error.rotation_deg}
-            scales[alignment] = error.scale
-            if alignment == "se3":
-                results |= {"ape_full": error.ape_full}
-        results["scale"] = scales.get("sim3")
-        return results, scales.get("sim3", scales.get("orientation"))
+        results = trajectory_results(self.trajectory(), read_tum(self.scene.groundtruth))
+        return results, results["scale"] or results["scale_orientation"]
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

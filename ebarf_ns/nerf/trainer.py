@@ -215,7 +215,12 @@ class EbarfTrainer(Trainer):
         restart_at = self.config.restart_field_at
         if restart_at is not None and before >= restart_at and not self.field_restarted:
             self._restart_field()
-        result = super().train_iteration(step)
+        try:
+            result = super().train_iteration(step)
+        except TrainingError as error:
+            # A batch follows from its step and the seed: with the state before it, the step can be looked into.
+            self.save_checkpoint(step)
+            raise TrainingError(f"{error}; --load-checkpoint {self._checkpoint_path()} does the last again") from None
         self.steps_done = step + 1
         self.train_seconds = self._agreed(self.train_seconds + monotonic() - started)
         self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2 * self.world_size
@@ -301,11 +306,10 @@ class EbarfTrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write the checkpoint whole, then remove older ones; the step is the last one done."""
-        step = max(self.steps_done - 1, 0)
-        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        path = self._checkpoint_path()
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         state = {
-            "step": step,
+            "step": self._last_step(),
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
@@ -325,6 +329,12 @@ class EbarfTrainer(Trainer):
             for old in self.checkpoint_dir.glob("step-*.ckpt"):
                 if old != path:
                     old.unlink()
+
+    def _last_step(self) -> int:
+        return max(self.steps_done - 1, 0)
+
+    def _checkpoint_path(self) -> Path:
+        return self.checkpoint_dir / f"step-{self._last_step():09d}.ckpt"
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()

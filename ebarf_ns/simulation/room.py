@@ -57,16 +57,17 @@ def _cast(origin, direction, walls, boxes, balls, window, wavelength, log_contra
     radiance = np.empty(count)
     distance = np.empty(count)
     for i in prange(count):
-        o, d = origin[i], direction[i]
+        o = (origin[i, 0], origin[i, 1], origin[i, 2])
+        d = (direction[i, 0], direction[i, 1], direction[i, 2])
         # Divided once; of a ray along a face, by what is as good as nothing.
         slow = (1 / (d[0] or _TINY), 1 / (d[1] or _TINY), 1 / (d[2] or _TINY))
         nearest, normal_axis, surface = _leave_box(o, slow, walls)
         for b in range(len(boxes)):
-            t, axis = _enter_box(o, slow, boxes[b])
+            t, axis = _enter_box(o, slow, boxes, b)
             if t < nearest:
                 nearest, normal_axis, surface = t, axis, 10 + b
         for b in range(len(balls)):
-            t = _enter_ball(o, d, balls[b])
+            t = _enter_ball(o, d, balls, b)
             if t < nearest:
                 nearest, normal_axis, surface = t, 3, 100 + b
         x = o[0] + nearest * d[0]
@@ -93,11 +94,11 @@ def _leave_box(origin, slowness, box):
 
 
 @njit(cache=True)
-def _enter_box(origin, slowness, box):
+def _enter_box(origin, slowness, boxes, b):
     near, far, normal_axis = 0.0, np.inf, 0
     for axis in range(3):
-        t0 = (box[axis] - origin[axis]) * slowness[axis]
-        t1 = (box[3 + axis] - origin[axis]) * slowness[axis]
+        t0 = (boxes[b, axis] - origin[axis]) * slowness[axis]
+        t1 = (boxes[b, 3 + axis] - origin[axis]) * slowness[axis]
         t0, t1 = min(t0, t1), max(t0, t1)
         if t0 > near:
             near, normal_axis = t0, axis
@@ -106,11 +107,11 @@ def _enter_box(origin, slowness, box):
 
 
 @njit(cache=True)
-def _enter_ball(origin, d, ball):
+def _enter_ball(origin, d, balls, b):
     along = 0.0
-    square = -ball[3] * ball[3]
+    square = -balls[b, 3] * balls[b, 3]
     for axis in range(3):
-        offset = origin[axis] - ball[axis]
+        offset = origin[axis] - balls[b, axis]
         along += offset * d[axis]
         square += offset * offset
     discriminant = along * along - square
@@ -129,10 +130,10 @@ def _pattern(x, y, z, normal_axis, seed, wavelength):
         y = 0.0
     elif normal_axis == 2:
         z = 0.0
-    value = 0.0
+    value, scale, weight = 0.0, 1 / wavelength, 1.0
     for octave in range(3):
-        scale = 2.0**octave / wavelength
-        value += 0.7**octave * _value_noise(x * scale, y * scale, z * scale, seed + 31 * octave)
+        value += weight * _value_noise(x * scale, y * scale, z * scale, seed + 31 * octave)
+        scale, weight = 2 * scale, 0.7 * weight
     # tanh(1.6 value)
     return 1 - 2 / (np.exp(3.2 * value) + 1)
 

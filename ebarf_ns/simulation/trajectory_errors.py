@@ -55,10 +55,11 @@ def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Traj
     count = len(trajectory.t_us)
     if count < 2 or seed < 0:
         raise SimulationError(f"{count} keyframes and seed {seed}, expected 2 keyframes or more, and a seed from 0 on")
-    noise = _random(seed, 99).standard_normal((count, 6)) * _sizes(errors.position_noise, errors.rotation_noise_rad)
-    noise += _drift(count, seed) * _sizes(errors.position_drift, errors.rotation_drift_rad)
-    noise += _wander(trajectory, errors.wander_s, seed) * _sizes(errors.position_wander, errors.rotation_wander_rad)
-    noise = torch.from_numpy(noise)
+    noise = torch.from_numpy(
+        _random(seed, 99).standard_normal((count, 6)) * _sizes(errors.position_noise, errors.rotation_noise_rad)
+        + _drift(count, seed) * _sizes(errors.position_drift, errors.rotation_drift_rad)
+        + _wander(trajectory, errors.wander_s, seed) * _sizes(errors.position_wander, errors.rotation_wander_rad)
+    )
     poses = trajectory.poses.compose(Poses(noise[:, 3:], quat_wxyz_exp(noise[:, :3])))
     kept = torch.from_numpy(_random(seed, 97).random(count) >= errors.dropped)
     kept[[0, -1]] = True

@@ -21,6 +21,8 @@ _SUBPIXELS = {
 }
 _PROBE_US = 250.0
 _KNOTS_EVERY_US = 50.0
+# Whose rays stay in the cache.
+_PIXELS_AT_ONCE = 16384
 
 
 class Surroundings(Protocol):
@@ -52,9 +54,13 @@ class View:
         knots_us = first_us + _KNOTS_EVERY_US * np.arange(2 + int((last_us - first_us) / _KNOTS_EVERY_US))
         rotation, position = self.motion.rotation(knots_us), self.motion.position(knots_us)
         place = (t_us - first_us) / _KNOTS_EVERY_US
-        radiance, distance = self.surroundings.cast(*_rays(self.bearings, pixel, place, rotation, position))
-        shape = (self.rays_per_pixel, len(pixel))
-        return radiance.reshape(shape).mean(axis=0), distance.reshape(shape).min(axis=0)
+        radiance, distance = np.empty(len(pixel)), np.empty(len(pixel))
+        for start in range(0, len(pixel), _PIXELS_AT_ONCE):
+            some = slice(start, start + _PIXELS_AT_ONCE)
+            seen, away = self.surroundings.cast(*_rays(self.bearings, pixel[some], place[some], rotation, position))
+            radiance[some] = seen.reshape(self.rays_per_pixel, -1).mean(axis=0)
+            distance[some] = away.reshape(self.rays_per_pixel, -1).min(axis=0)
+        return radiance, distance
 
     def images(
         self, t_us: Float[np.ndarray, "times"]

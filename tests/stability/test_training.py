@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from ebarf_ns.events.recording import Recording, read_recording, write_recording
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
+from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig
 from ebarf_ns.simulation.catalogue import Place
 from ebarf_ns.simulation.motion import HandheldMotion
 from ebarf_ns.simulation.room import Room
@@ -146,14 +147,27 @@ def test_case_27_a_step_with_a_broken_gradient_changes_nothing(
     assert not same(after, state(ready)) and ready.optimizers.skipped_in_a_row == 0
 
 
-def test_case_27_ten_broken_steps_in_a_row_end_the_run(
+def test_case_27_ten_broken_steps_in_a_row_end_the_run_and_can_be_done_again(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    ready = trainer(config(small_scene, tmp_path, steps=50))
+    def watched(made: EbarfTrainerConfig) -> tuple[EbarfTrainer, list[torch.Tensor]]:
+        ready, batches = trainer(made), []
+        ready.pipeline.model.register_forward_pre_hook(lambda _, rays: batches.append(rays[0].directions.clone()))
+        return ready, batches
+
+    ready, broken_batches = watched(config(small_scene, tmp_path, steps=50))
     ready.pipeline.model.camera_optimizer.correction.register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(SystemExit) as stopped:
         ready.train()
-    assert stopped.value.code == 2 and "10 training steps in a row" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and "10 training steps in a row" in said
+    again = config(small_scene, tmp_path / "again", steps=50)
+    (again.load_checkpoint,) = ready.checkpoint_dir.glob("*.ckpt")
+    assert again.load_checkpoint.name in said.replace("\n", "")
+    resumed, batches = watched(again)
+    resumed.pipeline.train()
+    resumed.train_iteration(resumed._start_step)
+    assert torch.equal(batches[0], broken_batches[-1])
 
 
 def test_case_28_poses_without_gradients_under_mixed_precision_do_not_end_the_run(small_scene: Path, tmp_path: Path):
@@ -299,6 +313,7 @@ def test_pure_rotation(tmp_path: Path):
     last = trained(scene.folder, tmp_path)
     # There is no path whose scale could be aligned; rotations still are.
     assert last["ate_m"] is None and last["scale"] is None and last["heldout_event_loss"] < LEARNED
+    assert last["rotation_deg"] < LOST_DEG
 
 
 def test_no_motion(small_scene: Path, tmp_path: Path):

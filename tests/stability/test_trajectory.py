@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.errors import TrajectoryError
-from ebarf_ns.geometry.trajectory import Poses, check_keyframes, corrected, interpolate, within_span
+from ebarf_ns.errors import EvaluationError, TrajectoryError
+from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes, corrected, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 
 F32, F64 = torch.float32, torch.float64
@@ -58,6 +59,13 @@ def test_case_12_outside_the_span_is_the_nearer_end_and_says_so(dtype: torch.dty
     # What callers do with such rays: their weight is nothing, and so is their gradient.
     (moved.position * within_span(outside, t_us)[:, None]).sum().backward()
     assert correction.grad is not None and (correction.grad == 0).all()
+
+
+def test_case_12_where_a_pose_outside_the_span_would_be_an_answer_it_is_an_error():
+    t_us, poses = keyframes(6, torch.float64)
+    truth = Trajectory(t_us, poses)
+    with pytest.raises(EvaluationError, match=f"{int(t_us[-1]) + 1} us.*{int(t_us[0])} to {int(t_us[-1])} us"):
+        reference_in_estimates_world(truth, truth, t_us[-1:] + 1)
 
 
 @pytest.mark.parametrize("times", [[], [5], [5, 5], [5, 4], [1, 2, 2]])
