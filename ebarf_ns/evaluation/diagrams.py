@@ -239,7 +239,8 @@ def tables(result: dict[str, Any]) -> str:
                 cells.append(f"{middle:.0f}" if math.isfinite(middle) else "not reached")
             lines += _row(scene, trajectory, method, *cells)
     failed = [record for record in result["records"] if record.get("error")]
-    lines += ["", f"{len(failed)} trainings failed." if failed else "No training failed."]
+    count = f"{len(failed)} training{'s' if len(failed) > 1 else ''}" if failed else "No training"
+    lines += ["", f"{count} failed."]
     lines += [f"- {record['method']}, {record['scene']}, seed {record['seed']}: {record['error']}" for record in failed]
     return "\n".join(lines) + "\n"
 

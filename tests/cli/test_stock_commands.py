@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -168,20 +169,22 @@ def test_export_cameras_are_the_refined_keyframes(trained_run: Path, tmp_path: P
     assert torch.allclose(world, refined, atol=1e-4) and not torch.allclose(world, initial, atol=1e-3)
 
 
-def test_a_run_outlives_its_recording(tiny_scene: Path, tmp_path: Path):
-    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
-    run_ok(
-        "ns-train", "ebarf", "--data", scene, "--output-dir", tmp_path, "--timestamp=run", "--vis=tensorboard",
-        *TINY_TRAINING, "--max-num-iterations=20",
-    )  # fmt: skip
-    (scene / "events.h5").unlink()
-    run = tmp_path / "scene" / "ebarf" / "run"
-    run_ok("ns-eval", *config(run), "--output-path", tmp_path / "eval.json")
+@pytest.fixture
+def without_recording(trained_run: Path, tiny_scene: Path, tmp_path: Path) -> Iterator[Path]:
+    """The trained run, as long as its recording is away."""
+    shutil.move(tiny_scene / "events.h5", tmp_path / "events.h5")
+    yield trained_run
+    shutil.move(tmp_path / "events.h5", tiny_scene / "events.h5")
+
+
+def test_a_run_outlives_its_recording(without_recording: Path, tmp_path: Path):
+    run = config(without_recording)
+    run_ok("ns-eval", *run, "--output-path", tmp_path / "eval.json")
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert results["heldout_event_loss"] is None and results["psnr"] > 5
-    run_ok("ns-export", "cameras", *config(run), "--output-dir", tmp_path / "cameras")
+    run_ok("ns-export", "cameras", *run, "--output-dir", tmp_path / "cameras")
     finished = run_command(
-        "ns-export", "pointcloud", *config(run), "--output-dir", tmp_path / "cloud", "--normal-method=open3d"
+        "ns-export", "pointcloud", *run, "--output-dir", tmp_path / "cloud", "--normal-method=open3d"
     )
     assert finished.code == 2 and "no such file, expected the recording" in finished.errors
 
