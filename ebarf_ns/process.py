@@ -1,114 +1,222 @@
-"""Other people's layouts to scene folders; sources are only read."""
+"""Other people's recordings to scene folders; sources are only read, and everything left out is counted."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, get_args
 
+import cv2
 import numpy as np
 import torch
 
+from ebarf_ns.calibration import read_calibration
 from ebarf_ns.errors import SceneError, TrajectoryError
-from ebarf_ns.events.readers.text import read_text_events
-from ebarf_ns.events.recording import Recording, write_recording
+from ebarf_ns.evaluation.conventions import read_by_reference
+from ebarf_ns.events.intake import Intake, hot_pixels, take_in
+from ebarf_ns.events.readers.text import TimeUnit
+from ebarf_ns.events.recognise import RecordingFormat, open_recording
 from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
+from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
-from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
-from ebarf_ns.scene import Frame, Scene, write_scene
+from ebarf_ns.geometry.trajectory_file import write_tum
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, order_is_known, read_trajectory
+from ebarf_ns.layouts import LAYOUTS, FrameFile, Ingredients, Layout, recognised_layout
+from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
-_DAVIS240C = (240, 180)
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+Format = Literal[
+    "auto", "ecd", "tumvie", "eds", "esim", "robust-e-nerf", "hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "text"
+]
 
 
-def process_ecd(
+@dataclass(frozen=True)
+class ProcessSettings:
+    """What a scene is made of, as far as the source does not say."""
+
+    trajectory: Path | None = None
+    """Initial keyframe poses; the reference itself where not given."""
+    trajectory_format: TrajectoryFormat = field(default_factory=TrajectoryFormat)
+    """What that file does not say of itself."""
+    groundtruth: Path | None = None
+    """Reference poses, where the dataset's folder has none; of the event camera, on its clock."""
+    camera: Path | None = None
+    """A calibration file, where the dataset's folder has none."""
+    camera_name: str | None = None
+    """Which camera of that file."""
+    sensor_size: tuple[int, int] | None = None
+    """Columns and rows, where neither recording nor calibration say so."""
+    contrast_threshold: tuple[float, float] | None = None
+    """On and off, where known."""
+    part: str | None = None
+    """The group of an HDF5 file or the topic of a bag that has the events, where several have."""
+    event_time_unit: TimeUnit | None = None
+    """Of the events in text and npz files, where they do not say so."""
+    events: Intake = field(default_factory=Intake)
+    """What to do with events."""
+    bounds: Bounds | None = None
+    """Lower and upper corner of the scene in the trajectory's unit, where known."""
+    farthest: float | None = None
+    """Bounds that hold everything in view up to this distance, in the trajectory's unit."""
+    frames: bool = True
+    """Take along the frames that the dataset has."""
+
+
+def process(
+    format: Format,
     source: Path,
     output: Path,
-    trajectory: Path | None = None,
-    sensor_size: tuple[int, int] = _DAVIS240C,
-    bounds: Bounds | None = None,
-) -> str:
-    """Make a scene of an event camera dataset folder (Mueggler et al. 2017) and say what was kept.
+    settings: ProcessSettings = ProcessSettings(),
+    progress: Callable[[int], None] = lambda events: None,
+) -> list[str]:
+    """Make a scene folder, and say what was read, recognised, repaired and left out.
 
-    ``events.txt`` (t x y p), ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3), ``groundtruth.txt`` (TUM) and, where there,
-    ``images.txt`` (t file). The initial trajectory is ``trajectory``, or the ground truth itself. Trajectories are
-    clipped to the events' span and one pose more at either end.
+    Raises the error of whatever room finds something wrong, in which case there is no folder.
     """
-    camera = _read_calibration(source / "calib.txt", sensor_size)
-    recording = read_text_events(source / "events.txt", *sensor_size)
-    groundtruth_file = source / "groundtruth.txt"
-    initial = _clip(trajectory or groundtruth_file, recording)
-    groundtruth = _clip(groundtruth_file, recording) if groundtruth_file.is_file() else None
-    images = _read_image_list(source / "images.txt") if (source / "images.txt").is_file() else []
-    start_us, end_us = int(recording.t_us[0]), int(recording.t_us[-1])
-    kept_images = [(t_us, path) for t_us, path in images if start_us <= t_us <= end_us]
-    with whole_folder(output) as folder:
-        write_recording(folder / "events.h5", recording)
-        write_tum(folder / "trajectory.txt", initial)
-        if groundtruth:
-            write_tum(folder / "groundtruth.txt", groundtruth)
-        scene = Scene(
-            folder=folder,
-            events=folder / "events.h5",
-            trajectory=folder / "trajectory.txt",
-            camera=camera,
-            groundtruth=folder / "groundtruth.txt" if groundtruth else None,
-            frames=tuple(_copy_frame(path, t_us, camera, folder) for t_us, path in kept_images),
-            bounds=bounds,
-        )
-        write_scene(scene)
-    return (
-        f"{len(recording):,} events over {(end_us - start_us) * 1e-6:.3f} s, {len(initial.t_us)} keyframes, "
-        f"{len(kept_images)} of {len(images)} frames within the events' span"
-    )
+    with _unpacked(source) as unpacked:
+        ingredients = _ingredients(format, unpacked, settings)
+        with whole_folder(output) as folder:
+            return _assemble(ingredients, settings, folder, progress)
 
 
-def _read_calibration(path: Path, sensor_size: tuple[int, int]) -> Camera:
-    expected = "9 numbers 'fx fy cx cy k1 k2 p1 p2 k3'"
+@contextmanager
+def _unpacked(source: Path) -> Iterator[Path]:
+    """The source, or what is in it where it is a zip file of a dataset."""
+    if source.suffix != ".zip":
+        yield source
+        return
     try:
-        text = path.read_text(encoding="utf-8")
-        values = [float(field) for field in text.split()]
-    except OSError as error:
-        raise SceneError(f"{path}: {error.strerror or error}, expected {expected}") from None
-    except ValueError as error:
-        raise SceneError(f"{path}: {error}, expected {expected}") from None
-    if len(values) != 9 or not np.isfinite(values).all() or min(values[:2]) <= 0:
-        raise SceneError(f"{path}: holds {' '.join(text.split())[:80]!r}, expected {expected}")
-    return Camera("radtan", *sensor_size, *values[:4], distortion=tuple(values[4:]))
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(source) as archive:
+            archive.extractall(folder)
+            inside = list(Path(folder).iterdir())
+            yield inside[0] if len(inside) == 1 and inside[0].is_dir() else Path(folder)
+    except (OSError, zipfile.BadZipFile) as error:
+        raise SceneError(f"{source}: not a whole zip file ({error})") from None
 
 
-def _clip(path: Path, recording: Recording) -> Trajectory:
+def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
+    if not source.exists():
+        raise SceneError(f"{source}: no such file or folder, expected a recording")
+    if format in LAYOUTS or (format == "auto" and source.is_dir() and not (source / "metadata.yaml").is_file()):
+        layout: Layout = recognised_layout(source) if format == "auto" else format  # pyright: ignore[reportAssignmentType]
+        if not source.is_dir():
+            raise SceneError(f"{source}: a file, expected the folder of a {layout} recording")
+        if layout == "ecd" and settings.sensor_size:
+            return LAYOUTS[layout](source, settings.sensor_size)
+        return LAYOUTS[layout](source)
+    known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]
+    return Ingredients(lambda: open_recording(source, known, settings.part, settings.event_time_unit))
+
+
+def _assemble(
+    ingredients: Ingredients, settings: ProcessSettings, folder: Path, progress: Callable[[int], None]
+) -> list[str]:
+    source = ingredients.open_events()
+    camera, notes = _camera(ingredients, settings, source.sensor_size), list(ingredients.notes)
+    size, intake = (camera.width, camera.height), settings.events
+    hot = hot_pixels(source, size, intake, intake.hot_pixels) if intake.hot_pixels is not None else None
+    source = ingredients.open_events() if hot is not None else source
+    report = take_in(source, size, intake, folder / "events.h5", hot, progress)
+    groundtruth = ingredients.groundtruth
+    if settings.groundtruth:
+        groundtruth, said = read_trajectory(settings.groundtruth, settings.trajectory_format)
+        notes += said
+    initial = groundtruth
+    if settings.trajectory:
+        initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth)
+        notes += said
+    if initial is None:
+        raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
+    span_us = report.first_us, report.last_us
+    initial = _clipped(initial, span_us, settings.trajectory or source.path)
+    write_tum(folder / "trajectory.txt", initial)
+    if groundtruth is not None:
+        groundtruth = _clipped(groundtruth, span_us, settings.groundtruth or source.path)
+        write_tum(folder / "groundtruth.txt", groundtruth)
+    threshold = ContrastThreshold(*settings.contrast_threshold) if settings.contrast_threshold else None
+    frames = [frame for frame in ingredients.frames if settings.frames and span_us[0] <= frame.t_us <= span_us[1]]
+    scene = Scene(
+        folder=folder,
+        events=folder / "events.h5",
+        trajectory=folder / "trajectory.txt",
+        camera=camera,
+        groundtruth=folder / "groundtruth.txt" if groundtruth is not None else None,
+        frames=tuple(_taken_along(frame, folder) for frame in frames),
+        contrast_threshold=threshold or ingredients.contrast_threshold,
+        bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
+    )
+    write_scene(scene)
+    notes.append(
+        f"{len(initial.t_us)} keyframes around the events, "
+        f"{len(frames)} of {len(ingredients.frames)} frames within their span"
+    )
+    return report.sentences() + notes
+
+
+def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int, int] | None) -> Camera:
+    camera = ingredients.camera
+    if settings.camera:
+        camera = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said).camera
+    if camera is None:
+        raise SceneError("no calibration with the recording, expected --camera with a file that has one")
+    if said is not None and said != (camera.width, camera.height):
+        raise SceneError(
+            f"the recording says its sensor has {said[0]} x {said[1]} pixels, the calibration {camera.width} x "
+            f"{camera.height}; expected those of one camera"
+        )
+    return camera
+
+
+def _initial(
+    path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None
+) -> tuple[Trajectory, list[str]]:
+    """As the file says; the order of quaternions that it does not say, the reference tells where there is one."""
+    if groundtruth is None or order_is_known(path, known):
+        return read_trajectory(path, known)
+    return read_by_reference(path, groundtruth, known)
+
+
+def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:
     """The poses within the events' span, and one more at either end."""
-    trajectory = read_tum(path)
-    span = torch.tensor([recording.t_us[0], recording.t_us[-1]])
-    first, last = torch.searchsorted(trajectory.t_us, span).tolist()
+    first, last = torch.searchsorted(trajectory.t_us, torch.tensor(span_us)).tolist()
     chosen = slice(max(first - 1, 0), last + 1)
     clipped = Trajectory(trajectory.t_us[chosen], Poses(*(column[chosen] for column in trajectory.poses)))
     if len(clipped.t_us) < 2:
         raise TrajectoryError(
-            f"{path}: poses from {trajectory.t_us[0]} to {trajectory.t_us[-1]} us, but events from {span[0]} to "
-            f"{span[1]} us; expected at least 2 poses around the events, in seconds on the same clock"
+            f"{path}: poses from {trajectory.t_us[0]} to {trajectory.t_us[-1]} us, but events from {span_us[0]} to "
+            f"{span_us[1]} us; expected at least 2 poses around the events, on the same clock"
         )
     return clipped
 
 
-def _read_image_list(path: Path) -> list[tuple[int, Path]]:
-    images = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        fields: Sequence[str] = line.split()
-        if not fields:
-            continue
-        try:
-            t_us = round(float(fields[0]) * 1e6)
-        except ValueError:
-            raise SceneError(f"{path}:{number}: {line!r:.60}, expected 't[s] file'") from None
-        if len(fields) != 2 or not (path.parent / fields[1]).is_file():
-            raise SceneError(f"{path}:{number}: {line!r:.60}, expected 't[s] file' with an existing file")
-        images.append((t_us, path.parent / fields[1]))
-    return images
+def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Corners of a box around the cameras and all that they see up to a distance."""
+    corners = torch.tensor(
+        [[x, y] for x in (0, (camera.width - 1) / 2, camera.width - 1) for y in (0, (camera.height - 1) / 2, camera.height - 1)]
+    )
+    bearings = camera.bearings(corners)
+    position, quat_wxyz = trajectory.poses
+    ends = position[:, None] + farthest * rotate(quat_wxyz[:, None], bearings[None].to(position))
+    points = torch.cat([position, ends.flatten(0, 1)])
+    return tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
 
 
-def _copy_frame(source: Path, t_us: int, camera: Camera, folder: Path) -> Frame:
-    path = folder / "frames" / source.name
+def _taken_along(frame: FrameFile, folder: Path) -> Frame:
+    """A copy: PNG where the scene can hold it as it is."""
+    path = folder / "frames" / f"{frame.path.stem}.png"
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(source.read_bytes())
-    # The DAVIS' frames are linear up to its sensor's offset.
-    return Frame(path, t_us, camera, tuple(map(tuple, np.eye(4).tolist())), "linear")
+    if frame.path.suffix.lower() == ".png":
+        path.write_bytes(frame.path.read_bytes())
+    else:
+        image = cv2.imread(str(frame.path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise SceneError(f"{frame.path}: not a readable image")
+        cv2.imwrite(str(path), image)
+    extrinsic = tuple(map(tuple, np.asarray(frame.event_camera_from_frame_camera, float).tolist()))
+    return Frame(path, frame.t_us, frame.camera, extrinsic, frame.intensity)
+

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+import yaml
 from rich.console import Console
-from rich.progress import Progress, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark
 from ebarf_ns.errors import EbarfError, one_line_errors
-from ebarf_ns.process import Bounds
+from ebarf_ns.process import Format, ProcessSettings
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
 
@@ -39,26 +40,43 @@ class Simulate:
 
 @dataclass
 class Process:
-    """Make a scene folder of a recording; ecd is the event camera dataset's text layout (Mueggler et al. 2017)."""
+    """Make a scene folder of a recording, whatever wrote it; the source is only read, what is left out is counted."""
 
-    format: tyro.conf.Positional[Literal["ecd"]]
-    source: tyro.conf.Positional[Path]
-    """The recording's folder, which is only read."""
     output: Path
     """The scene folder to make."""
-    trajectory: Path | None = None
-    """Initial keyframe poses as a TUM file; groundtruth.txt where not given."""
-    sensor_size: tuple[int, int] = (240, 180)
-    """Columns and rows; the DAVIS240C of the dataset."""
-    bounds: Bounds | None = None
-    """Lower and upper corner of the scene in world units, where known."""
+    format: tyro.conf.Positional[Format] = "auto"
+    """What the source is; a dataset's folder or a recording's file is recognised where not given."""
+    folder: tyro.conf.Positional[Path | None] = None
+    """The recording: a dataset's folder as it was downloaded, or a file."""
+    source: Path | None = None
+    """The same, as a flag."""
+    config: Path | None = None
+    """A YAML file of flags, such as those in configs/ for public scenes; flags given beside it come first."""
+    settings: tyro.conf.OmitArgPrefixes[ProcessSettings] = field(default_factory=ProcessSettings)
+    """What the source does not say of itself."""
 
     def run(self) -> None:
         """Make the scene and say what is in it."""
-        from ebarf_ns.process import process_ecd
+        from ebarf_ns.errors import SceneError
+        from ebarf_ns.process import process
 
         _refuse_existing(self.output)
-        _stderr.print(process_ecd(self.source, self.output, self.trajectory, self.sensor_size, self.bounds))
+        source = self.folder or self.source
+        if source is None:
+            raise SceneError("no recording named, expected: ebarf process FORMAT SOURCE --output SCENE")
+        with Progress(
+            TextColumn("{task.description}"), SpinnerColumn(), TimeElapsedColumn(), transient=True, console=_stderr
+        ) as progress:
+            task = progress.add_task("reading", total=None)
+            said = process(
+                self.format,
+                source,
+                self.output,
+                self.settings,
+                lambda events: progress.update(task, description=f"{events:,} events"),
+            )
+        for sentence in said:
+            _stderr.print(sentence, soft_wrap=True)
 
 
 @dataclass
@@ -230,6 +248,32 @@ def _refuse_existing(output: Path) -> None:
         raise SceneError(f"{output}: exists, expected a new folder; remove it first where it is not needed")
 
 
+def _with_config(words: list[str]) -> list[str]:
+    """The words of a command, those of the file that ``--config`` names before the others, which may overrule them."""
+    if words[:1] != ["process"] or "--config" not in words[:-1]:
+        return words
+    from ebarf_ns.errors import SceneError
+
+    path = Path(words[words.index("--config") + 1])
+    source = words[words.index("--source") + 1] if "--source" in words[:-1] else ""
+    places = {"{source}": source, "{config}": str(path.parent)}
+    try:
+        flags = yaml.safe_load(path.read_text(encoding="utf-8"))
+        format_ = [flags.pop("format")] if "format" in flags else []
+        found = [word for name, value in flags.items() for word in _flag(name, value, places)]
+    except (OSError, yaml.YAMLError, AttributeError, TypeError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise SceneError(f"{path}: {reason}; expected a YAML file of flags and their values") from None
+    return ["process", *format_, *found, *words[1:]]
+
+
+def _flag(name: str, value: Any, places: dict[str, str]) -> list[str]:
+    words = [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+    for place, path in places.items():
+        words = [word.replace(place, path) for word in words]
+    return words
+
+
 def entrypoint() -> None:
     """The console script."""
     with one_line_errors():
@@ -243,5 +287,6 @@ def entrypoint() -> None:
                 "bench": Bench,
             },
             description=__doc__,
+            args=_with_config(sys.argv[1:]),
         )
         command.run()

@@ -1,5 +1,6 @@
 """How far a trajectory is from a reference, through the evo library."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 
 # Motion across the main direction below this share of that along it counts as a line.
 _THINNEST = 0.01
+_ALTERNATIONS = 20
 Alignment = Literal["se3", "sim3", "orientation"]
 _SUFFIXES: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
 """How results say which alignment a number is of."""
@@ -61,8 +63,8 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     )
     return TrajectoryError(
         ate_m=float(position_error.get_statistic(metrics.StatisticsType.rmse)),
-        rotation_deg=_rotation_error_deg(turned, straight, iterations=0),
-        rotation_deg_body=_rotation_error_deg(turned, straight, iterations=20),
+        rotation_deg=_rotation_error_deg(turned, straight, with_body=False),
+        rotation_deg_body=_rotation_error_deg(turned, straight, with_body=True),
         ape_full=float(full_error.get_statistic(metrics.StatisticsType.mean)),
         scale=float(scale),
         matched=int(estimated.num_poses),
@@ -110,23 +112,37 @@ def _rotations(path: PosePath3D) -> Rotation:
     return Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3])
 
 
-def _rotations_alone_deg(estimate: Trajectory, reference: Trajectory) -> float | None:
-    try:
-        estimated, true = _matched(estimate, reference)
-    except EvaluationError:
-        return None
-    return _rotation_error_deg(_rotations(estimated), _rotations(true), iterations=0)
+def rotation_errors_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
+    """The rotation errors of :class:`TrajectoryError`, without and with one for the body, which need no motion.
+
+    Raises :class:`EvaluationError` for fewer than 3 poses within the reference's span.
+    """
+    estimated, true = _matched(estimate, reference)
+    turned, straight = _rotations(estimated), _rotations(true)
+    return _rotation_error_deg(turned, straight, with_body=False), _rotation_error_deg(turned, straight, with_body=True)
 
 
-def _rotation_error_deg(estimate: Rotation, true: Rotation, iterations: int) -> float:
-    """RMSE of true = world * estimate * body with the best world rotation, and by alternation the best body one."""
-    body = Rotation.identity()
-    world = (true * estimate.inv()).mean()
-    for _ in range(iterations):
+def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> float:
+    """RMSE of true = world * estimate * body with the best world rotation, and if asked for with the best body one."""
+    body = _body(estimate, true) if with_body else Rotation.identity()
+    world = (true * (estimate * body).inv()).mean()
+    for _ in range(_ALTERNATIONS if with_body else 0):
         body = ((world * estimate).inv() * true).mean()
         world = (true * (estimate * body).inv()).mean()
     errors = (world * estimate * body).inv() * true
     return float(np.degrees(np.sqrt(np.mean(errors.magnitude() ** 2))))
+
+
+def _body(estimate: Rotation, true: Rotation) -> Rotation:
+    """The body's rotation from relative ones, which know no world: their axes differ by it (hand-eye calibration)."""
+    lag = max(1, len(estimate) // 10)
+    of_estimate, of_true = ((path[:-lag].inv() * path[lag:]).as_rotvec() for path in (estimate, true))
+    if min(np.linalg.norm(of_estimate), np.linalg.norm(of_true)) < 1e-9:
+        return Rotation.identity()
+    with warnings.catch_warnings():
+        # Turns about one axis leave the turn about that axis open, which the alternation then finds.
+        warnings.simplefilter("ignore")
+        return Rotation.align_vectors(of_estimate, of_true)[0]
 
 
 def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, PosePath3D]:
@@ -166,7 +182,11 @@ def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str,
     Rotations have an error wherever 3 poses match, also about a camera that stays where it is.
     """
     errors, _ = _under_each_alignment(estimate, reference)
-    results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": _rotations_alone_deg(estimate, reference)}
+    try:
+        rotation_deg, _ = rotation_errors_deg(estimate, reference)
+    except EvaluationError:
+        rotation_deg = None
+    results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": rotation_deg}
     for alignment, suffix in _SUFFIXES.items():
         error = errors.get(alignment)
         results |= {f"ate_m{suffix}": error and error.ate_m, f"scale{suffix}": error and error.scale}

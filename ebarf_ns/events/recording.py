@@ -84,7 +84,7 @@ class RecordingFile:
         with self._columns() as (columns, t_offset_us):
             t = columns["t"]
             first, last = bisect_left(t, start_us - t_offset_us), bisect_right(t, end_us - t_offset_us)
-            return _joined(self._pieces(columns, t_offset_us, first, last, 1 << 22))
+            return joined(self._pieces(columns, t_offset_us, first, last, 1 << 22))
 
     def _pieces(
         self,
@@ -159,10 +159,11 @@ class RecordingFile:
 
 def read_recording(path: Path, width: int, height: int) -> Recording:
     """All of a :class:`RecordingFile` in one piece."""
-    return _joined(RecordingFile(path, width, height).chunks())
+    return joined(RecordingFile(path, width, height).chunks())
 
 
-def _joined(pieces: Iterable[Recording]) -> Recording:
+def joined(pieces: Iterable[Recording]) -> Recording:
+    """Pieces that follow each other as one recording."""
     nothing = Recording(np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.int64), np.zeros(0, np.int8))
     parts = list(pieces) or [nothing]
     columns = ("x", "y", "t_us", "polarity")

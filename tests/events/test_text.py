@@ -2,20 +2,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.intake import checked
 from ebarf_ns.events.readers import text
-from ebarf_ns.events.readers.text import read_text_events
+from ebarf_ns.events.readers.text import TimeUnit, read_text
+from ebarf_ns.events.recording import Recording
 
 WIDTH, HEIGHT = 240, 180
 
 
-def read(tmp_path: Path, content: str | bytes):
+def read(tmp_path: Path, content: str | bytes, unit: TimeUnit | None = "s") -> Recording:
     path = tmp_path / "events.txt"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_text_events(path, WIDTH, HEIGHT)
+    return checked(read_text(path, unit), (WIDTH, HEIGHT))
 
 
 def test_times_are_exact(tmp_path: Path):
@@ -25,6 +27,7 @@ def test_times_are_exact(tmp_path: Path):
     assert recording.x.tolist() == [96, 1, 239] and recording.polarity.tolist() == [-1, 1, 1]
 
 
+@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**13), st.integers(0, 239), st.integers(0, 179), st.integers(0, 1)), min_size=1
@@ -45,6 +48,8 @@ def test_any_events_read_back(tmp_path_factory: pytest.TempPathFactory, events: 
         ("0.2 1 2", "is not an event, expected 't[s] x y p'"),
         ("0.2 1 2 1 0", "is not an event"),
         ("0.2 1.5 2 1", "is not an event"),
+        ("0.2 1e-1 2 1", "is not an event"),
+        ("0.2 1 2 1e", "is not an event"),
         ("0.2 -1 2 1", "is not an event"),
         ("0.2.1 1 2 1", "is not an event"),
         ("nan 1 2 1", "is not an event"),
@@ -52,16 +57,17 @@ def test_any_events_read_back(tmp_path_factory: pytest.TempPathFactory, events: 
         ("-. 1 2 1", "is not an event"),
         ("0.2 one 2 1", "is not an event"),
         ("12345678901234567890 1 2 1", "is not an event"),
-        ("0.2 240 2 1", "x is 240, expected 0 to 239"),
-        ("0.2 2 180 1", "y is 180, expected 0 to 179"),
-        ("0.2 2 18 2", "p is 2, expected 0 (darker) or 1 (brighter)"),
-        ("0.05 2 18 1", "t is 50000 us, expected a time not before"),
+        ("0.2 240 2 1", "x of line 3 is 240, expected 0 to 239"),
+        ("0.2 2 180 1", "y of line 3 is 180, expected 0 to 179"),
+        ("0.2 2 18 2", "polarity of line 3 is 2, expected 0 (darker) and 1 (brighter)"),
+        ("0.05 2 18 1", "line 3 is at 50000 us, after one at 100000 us"),
     ],
 )
 def test_bad_line_is_named(tmp_path: Path, line: str, words: str):
     with pytest.raises(RecordingError) as caught:
         read(tmp_path, f"# comment\n0.1 1 1 1\n{line}\n0.3 1 1 1\n")
-    assert str(caught.value).startswith(f"{tmp_path / 'events.txt'}:3:") and words in str(caught.value)
+    said = str(caught.value)
+    assert said.startswith(f"{tmp_path / 'events.txt'}:") and words in said and ("line 3" in said or ".txt:3:" in said)
 
 
 @pytest.mark.parametrize("content", ["", "\n\n", "# only a comment\n"])
@@ -79,6 +85,29 @@ def test_blocks_of_any_size_give_the_same(tmp_path: Path, monkeypatch: pytest.Mo
         assert np.array_equal(again.t_us, whole.t_us) and np.array_equal(again.x, whole.x)
 
 
+@pytest.mark.parametrize(
+    ("content", "unit", "t_us"),
+    [
+        ("240 180\n0.001 1 2 1\n0.002 1 2 0\n", None, [1000, 2000]),
+        ("240 180\n1000 1 2 1\n2000 1 2 0\n", None, [1000, 2000]),
+        ("x,y,polarity,timestamp_ns\n1,2,1,1499\n1,2,0,1500\n", None, [1, 2]),
+        ("# made by a program\nt[ms];x;y;p\n0.25;1;2;1\n1.5;1;2;0\n", None, [250, 1500]),
+        ("1.000000000000000000e+01 1.0e+00 2.0e+00 1.0e+00\n1.000000150000000000e+01 1 2 0\n", None, [10**7, 10**7 + 2]),
+        ("5 1 2 1\n6 1 2 -1\n", "ms", [5000, 6000]),
+        ("time y x p extra\n0.5 2 1 1 9.9\n0.6 2 1 0 -3\n", None, [500_000, 600_000]),
+    ],
+)
+def test_columns_and_units_as_files_have_them(tmp_path: Path, content: str, unit: TimeUnit | None, t_us: list[int]):
+    recording = read(tmp_path, content, unit)
+    assert recording.t_us.tolist() == t_us and recording.x.tolist() == [1, 1] and recording.y.tolist() == [2, 2]
+    assert recording.polarity.tolist() == [1, -1]
+
+
+def test_columns_that_are_missing_are_named(tmp_path: Path):
+    with pytest.raises(RecordingError, match="expected t, x, y and p once each"):
+        read(tmp_path, "t,x,p\n1,2,1\n", None)
+
+
 def test_binary_rubbish_is_an_error(tmp_path: Path):
-    with pytest.raises(RecordingError, match="is not an event"):
+    with pytest.raises(RecordingError, match="events.txt"):
         read(tmp_path, bytes(range(256)))

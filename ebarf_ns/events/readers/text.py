@@ -1,90 +1,166 @@
-"""Events as text, one ``t[s] x y p`` a line: exact decimal times, every malformed line named."""
+"""Events as text, a line each: exact decimal times, every malformed line named.
 
+``t x y p`` in any order that a line of names above them gives, separated by blanks, commas or semicolons; a first line
+``width height`` is rpg_e2vid's. Numbers may have points and exponents, as ``numpy.savetxt`` writes them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.recording import Recording
+from ebarf_ns.events.source import Piece, Source
 
-_BLOCK_BYTES = 1 << 24
-_COLUMNS = 4
-_LONGEST_NUMBER = 18  # digits that fit int64
+TimeUnit = Literal["s", "ms", "us", "ns"]
+DECIMALS: dict[TimeUnit, int] = {"s": 6, "ms": 3, "us": 0, "ns": -3}
+"""By which power of ten a time becomes microseconds."""
+_BLOCK_BYTES = 1 << 22
+_TIME, _X, _Y, _POLARITY, _LINE, _TABLE = range(6)
+_ROLES = {
+    "t": _TIME, "ts": _TIME, "time": _TIME, "timestamp": _TIME, "timestamps": _TIME, "x": _X, "y": _Y, "p": _POLARITY,
+    "pol": _POLARITY, "polarity": _POLARITY, "on": _POLARITY,
+}  # fmt: skip
+_UNITS: dict[str, TimeUnit] = {
+    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"
+}  # fmt: skip
+_SIGNIFICANT = 18  # digits that fit int64
+_UNUSED = -1
 
 
-def read_text_events(path: Path, width: int, height: int) -> Recording:
-    """Read ``t[s] x y p`` lines, p 0 or 1; blank lines and ``#`` comments are allowed.
+class _Layout(NamedTuple):
+    roles: tuple[int, ...]
+    """Of each column."""
+    unit: TimeUnit
+    sensor_size: tuple[int, int] | None
+    header_lines: int
+
+
+def read_text(path: Path, time_unit: TimeUnit | None = None) -> Source:
+    """Times are seconds where they have a point, and else microseconds, unless the names or ``time_unit`` say otherwise.
 
     Raises :class:`RecordingError` with file, line, text and expectation; nothing is repaired or dropped.
     """
+    layout = _layout(path, time_unit)
+    name = f"text, times in {layout.unit}"
+    return Source(path, name, layout.sensor_size, _pieces(path, layout))
+
+
+def _layout(path: Path, time_unit: TimeUnit | None) -> _Layout:
+    """What the first lines say about the others."""
+    size, roles, unit = None, (_TIME, _X, _Y, _POLARITY), None
+    for number, fields in _first_lines(path):
+        numeric = [_decimal(field) for field in fields]
+        if None in numeric and roles == (_TIME, _X, _Y, _POLARITY) and unit is None:
+            roles, unit = _named_columns(path, number, fields)
+            continue
+        if len(fields) == 2 and size is None and None not in numeric:
+            size = int(numeric[0] or 0), int(numeric[1] or 0)
+            continue
+        column = roles.index(_TIME)
+        time = fields[column] if column < len(fields) else ""
+        found: TimeUnit = "s" if re.search("[.eE]", time) else "us"
+        return _Layout(roles, time_unit or unit or found, size, number - 1)
+    raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
+
+
+def _first_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     try:
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            for number in range(1, 1000):
+                line = file.readline(1 << 16)
+                if not line:
+                    return
+                fields = re.split(r"[\s,;]+", line.decode("latin-1").split("#")[0].strip(" \t\r\n,;"))
+                if fields != [""]:
+                    yield number, fields
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
-    table = np.concatenate([_parse_block(path, *block) for block in _line_blocks(content)] or [np.zeros((0, 5), int)])
-    if not len(table):
-        raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
-    t_us, x, y, p, line = table.T
-    late = np.r_[False, t_us[1:] < t_us[:-1]]
-    for name, column, wrong, expected in (
-        ("x", x, x >= width, f"0 to {width - 1}, the sensor width"),
-        ("y", y, y >= height, f"0 to {height - 1}, the sensor height"),
-        ("p", p, p > 1, "0 (darker) or 1 (brighter)"),
-        ("t", t_us, late, "a time not before that of the event above it"),
-    ):
-        if wrong.any():
-            row = int(wrong.argmax())
-            raise RecordingError(
-                f"{path}:{line[row]}: {name} is {column[row]}{' us' if name == 't' else ''}, expected {expected} "
-                f"({np.count_nonzero(wrong):,} such lines)"
-            )
-    return Recording(x.astype(np.uint16), y.astype(np.uint16), np.ascontiguousarray(t_us), (2 * p - 1).astype(np.int8))
 
 
-def _line_blocks(content: bytes):
+def _decimal(text: str) -> Decimal | None:
+    try:
+        return Decimal(text)
+    except InvalidOperation:
+        return None
+
+
+def _named_columns(path: Path, number: int, fields: list[str]) -> tuple[tuple[int, ...], TimeUnit | None]:
+    unit: TimeUnit | None = None
+    roles = []
+    for field in fields:
+        name, _, of = field.lower().strip("\"'").replace("[", "_").rstrip("])").replace("(", "_").partition("_")
+        role = _ROLES.get(name, _UNUSED)
+        if role == _TIME and of in _UNITS:
+            unit = _UNITS[of]
+        roles.append(role)
+    if sorted(role for role in roles if role != _UNUSED) != [_TIME, _X, _Y, _POLARITY]:
+        raise RecordingError(f"{path}:{number}: columns {' '.join(fields)!r:.60}, expected t, x, y and p once each")
+    return tuple(roles), unit
+
+
+def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
+    roles = np.array(layout.roles)
+    for block, line in _line_blocks(path, layout.header_lines):
+        content = np.frombuffer(block, np.uint8)
+        table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], block.count(b"\n") + 1)
+        if bad_line:
+            text = block.split(b"\n")[bad_line - line].decode(errors="replace").strip()
+            names = " ".join(name for role in layout.roles for name in ("t x y p".split()[role] if role >= 0 else "-",))
+            raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'")
+        if len(table):
+            t_us, x, y, polarity, lines = table.T
+            yield Piece(x, y, np.ascontiguousarray(t_us), polarity, lambda k, lines=lines: f"line {lines[k]:,}")
+
+
+def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
     """Blocks of whole lines, each with the number of its first line."""
-    start, line = 0, 1
-    while start < len(content):
-        end = content.find(b"\n", min(start + _BLOCK_BYTES, len(content)))
-        end = len(content) if end < 0 else end + 1
-        block = content[start:end]
-        yield block, line
-        line += block.count(b"\n")
-        start = end
-
-
-def _parse_block(path: Path, block: bytes, first_line: int) -> Int64[np.ndarray, "events 5"]:
-    table, bad_line = _parse(np.frombuffer(block, np.uint8), first_line, block.count(b"\n") + 1)
-    if bad_line:
-        text = block.split(b"\n")[bad_line - first_line].decode(errors="replace").strip()
-        raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected 't[s] x y p'")
-    return table
+    line, rest = 1 + header_lines, b""
+    with path.open("rb") as file:
+        for _ in range(header_lines):
+            file.readline()
+        while content := file.read(_BLOCK_BYTES):
+            whole, newline, rest = (rest + content).rpartition(b"\n")
+            if newline:
+                yield whole + newline, line
+                line += whole.count(b"\n") + 1
+    if rest:
+        yield rest, line
 
 
 @njit(cache=True)
-def _parse(content, first_line, most):
+def _parse(content, first_line, roles, time_decimals, most) -> Int64[np.ndarray, "events 5"]:
     """Rows (t_us, x, y, p, line), and the number of the first malformed line or 0."""
-    table = np.empty((most, _COLUMNS + 1), np.int64)
+    table = np.empty((most, _TABLE), np.int64)
     count = 0
     i, line = 0, first_line
     while i < len(content):
-        column, ok, comment = 0, True, False
+        column, comment = 0, False
         while i < len(content) and content[i] != 10:
             c = content[i]
             if c == 35:  # '#'
                 comment = True
-            if comment or c == 32 or c == 9 or c == 13 or c == 44:
+            if comment or c == 32 or c == 9 or c == 13 or c == 44 or c == 59:
                 i += 1
                 continue
-            value, i, ok = _number(content, i, 6 if column == 0 else 0)
-            if not ok or column >= _COLUMNS:
+            if column >= len(roles):
                 return table[:count], line
-            table[count, column] = value
+            role = roles[column]
+            value, i, ok = _number(content, i, time_decimals if role == _TIME else 0, role == _TIME)
+            if role != _UNUSED:
+                if not ok or (value < 0 and (role == _X or role == _Y)):
+                    return table[:count], line
+                table[count, role] = value
             column += 1
-        if column == _COLUMNS:
-            table[count, _COLUMNS] = line
+        if column == len(roles):
+            table[count, _LINE] = line
             count += 1
         elif column:
             return table[:count], line
@@ -94,33 +170,54 @@ def _parse(content, first_line, most):
 
 
 @njit(cache=True)
-def _number(content, i, decimals):
-    """A number times 10**decimals, rounded; further digits than that only where decimals are expected."""
+def _number(content, i, decimals, rounded):
+    """A number times 10**decimals, as an integer; where it is none, rounded or wrong."""
     negative = content[i] == 45  # '-'
-    i += 1 if negative else 0
-    value, digits, after_point, round_up = 0, 0, -1, False
-    start = i
+    i += 1 if negative or content[i] == 43 else 0
+    value, power, digits, seen, after_point = 0, decimals, 0, False, False
     while i < len(content):
         c = content[i]
-        if c == 46 and after_point < 0 and decimals > 0:  # '.'
-            after_point = 0
+        if c == 46 and not after_point:  # '.'
+            after_point = True
         elif 48 <= c <= 57:
-            if after_point < decimals:
+            seen = True
+            if digits < _SIGNIFICANT:
                 value = 10 * value + (c - 48)
-                digits += 1
-            elif after_point == decimals:
-                round_up = c >= 53
-            if after_point >= 0:
-                after_point += 1
+                digits += 1 if value else 0
+                power -= 1 if after_point else 0
+            else:
+                power += 0 if after_point else 1
         else:
             break
         i += 1
-    read_any = i - start > (1 if after_point >= 0 else 0)
-    for _ in range(max(after_point, 0), decimals):
-        value *= 10
-        digits += 1
-    value += 1 if round_up else 0
-    separated = i == len(content) or content[i] in (32, 9, 10, 13, 44, 35)
-    ok = read_any and digits <= _LONGEST_NUMBER and separated
-    # Coordinates and polarities are never negative; times may be.
-    return (-value if negative else value), i, ok and (decimals > 0 or not negative)
+    ok = seen
+    if i < len(content) and (content[i] == 101 or content[i] == 69):  # 'e', 'E'
+        i += 1
+        sign = 1
+        if i < len(content) and (content[i] == 45 or content[i] == 43):
+            sign = -1 if content[i] == 45 else 1
+            i += 1
+        exponent, any_digit = 0, False
+        while i < len(content) and 48 <= content[i] <= 57:
+            exponent = min(10 * exponent + (content[i] - 48), 1000)
+            any_digit = True
+            i += 1
+        ok = ok and any_digit
+        power += sign * exponent
+    if i < len(content) and not (content[i] in (32, 9, 10, 13, 44, 59, 35)):
+        ok = False
+        while i < len(content) and not (content[i] in (32, 9, 10, 13, 44, 59, 35)):
+            i += 1
+    if value and power > 0:
+        ok = ok and digits + power <= _SIGNIFICANT
+        for _ in range(min(power, _SIGNIFICANT)):
+            value *= 10
+    elif power < 0:
+        unit = 1
+        for _ in range(min(-power, _SIGNIFICANT)):
+            unit *= 10
+        rest = value % unit if -power <= _SIGNIFICANT else value
+        value = value // unit if -power <= _SIGNIFICANT else 0
+        ok = ok and (rounded or rest == 0)
+        value += 1 if 2 * rest >= unit else 0
+    return -value if negative else value, i, ok

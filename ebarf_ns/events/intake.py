@@ -1,0 +1,337 @@
+"""From any source to the scene's ``events.h5``: every event checked, nothing lost in silence, memory bounded.
+
+What a file does wrong is one of three things: an error; a repair that was asked for, or that leaves no doubt, and is
+counted; or nothing wrong at all, like equal times at different pixels.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import h5py
+import numpy as np
+from numba import njit
+
+from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.recording import Recording, joined
+from ebarf_ns.events.source import Piece, Source
+from ebarf_ns.files import whole_file
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int64
+
+_MAX_TIME_US = 1 << 61
+# Counters of 31 and 32 bits begin anew; before and after that they are this near to their ends.
+_WRAPS_US, _NEAR_US = (1 << 31, 1 << 32), 1_000_000
+_RUN = np.dtype([("t_us", "<i8"), ("x", "<u2"), ("y", "<u2"), ("polarity", "i1")])
+_MERGED_AT_ONCE, _SAMPLE_EVERY = 1 << 20, 1 << 10
+_LONGEST_SPAN_US = 1 << 39
+_CHUNK = 1 << 17
+
+
+@dataclass(frozen=True)
+class Intake:
+    """What to do with events on their way in."""
+
+    unsorted: Literal["refuse", "sort"] = "refuse"
+    """Of events that are earlier than those before them: refuse the file, or sort it (stably)."""
+    duplicates: Literal["keep", "drop"] = "keep"
+    """Of events equal to the last one of their pixel in time and polarity."""
+    hot_pixels: float | None = None
+    """Leave out pixels with more events than the median of the active ones plus this many median deviations."""
+    refractory_us: int = 0
+    """Leave out events that follow the last one kept of their pixel within less than this."""
+    time_offset_us: int = 0
+    """Added to every time."""
+    start_us: int | None = None
+    """Leave out events before this, on the recording's own clock after the offset."""
+    end_us: int | None = None
+    """Leave out events after this."""
+
+
+@dataclass
+class IntakeReport:
+    """What was read, repaired and left out."""
+
+    format: str = ""
+    read: int = 0
+    kept: int = 0
+    first_us: int = 0
+    last_us: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    repaired: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+
+    def sentences(self) -> list[str]:
+        """For people."""
+        span_s = (self.last_us - self.first_us) * 1e-6
+        found = [f"{self.format}: {self.read:,} events read, {self.kept:,} kept, over {span_s:.3f} s"]
+        found += [f"left out: {count:,} {reason}" for reason, count in self.left_out.items() if count]
+        found += [f"repaired: {count:,} {what}" for what, count in self.repaired.items() if count]
+        return found + self.notes
+
+
+def take_in(
+    source: Source,
+    sensor_size: tuple[int, int],
+    intake: Intake,
+    output: Path,
+    hot: Bool[np.ndarray, "pixels"] | None = None,
+    progress: Callable[[int], None] = lambda events: None,
+) -> IntakeReport:
+    """Write ``output`` in the layout that :class:`~ebarf_ns.events.recording.RecordingFile` reads.
+
+    ``hot`` marks the pixels to leave out, see :func:`hot_pixels`. Raises :class:`RecordingError` naming file, place,
+    value and expectation for whatever is not an event of a sensor of that size, in order.
+    """
+    report = IntakeReport(source.format)
+    pieces = _checked(source, sensor_size, intake, report, progress)
+    if intake.unsorted == "sort":
+        pieces = _sorted(pieces, report)
+    kept = _filtered(pieces, sensor_size, intake, hot, report)
+    _write(output, source.path, kept, report)
+    report.left_out += source.dropped
+    return report
+
+
+def checked(source: Source, sensor_size: tuple[int, int]) -> Recording:
+    """All events in memory, for recordings that are small; raises what :func:`take_in` raises."""
+    return joined(_checked(source, sensor_size, Intake(), IntakeReport(), lambda events: None))
+
+
+def hot_pixels(
+    source: Source, sensor_size: tuple[int, int], intake: Intake, deviations: float
+) -> Bool[np.ndarray, "pixels"]:
+    """Pixels far busier than usual over the whole recording: median + ``deviations`` x median absolute deviation.
+
+    Of pixels that have events at all; a deviation counts at least a tenth of the median, lest evenly busy sensors
+    have hot pixels.
+    """
+    width, height = sensor_size
+    counts = np.zeros(width * height, np.int64)
+    for piece in _checked(source, sensor_size, intake, IntakeReport(), lambda events: None):
+        counts += np.bincount(piece.pixels(width), minlength=len(counts))
+    active = counts[counts > 0]
+    if not len(active):
+        return counts > 0
+    middle = float(np.median(active))
+    deviation = max(float(np.median(np.abs(active - middle))), 0.1 * middle)
+    return counts > middle + deviations * deviation
+
+
+def _checked(
+    source: Source,
+    sensor_size: tuple[int, int],
+    intake: Intake,
+    report: IntakeReport,
+    progress: Callable[[int], None],
+) -> Iterator[Recording]:
+    """Pieces of valid events, in the order of the file, within the window."""
+    width, height = sensor_size
+    turned_us, before_us, lowest, highest = 0, None, 1, 0
+    for piece in source.pieces:
+        _check_values(source.path, piece, width, height)
+        lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
+        _check_polarity(source.path, piece, lowest, highest)
+        t_us, turned_us = _unwrapped(piece.t_us + turned_us, before_us, turned_us, report)
+        _check_order(source.path, piece, t_us, before_us, intake, report)
+        before_us = int(t_us[-1]) if before_us is None else max(before_us, int(t_us.max()))
+        report.read += len(piece)
+        progress(report.read)
+        polarity = np.where(piece.polarity > 0, 1, -1).astype(np.int8)
+        events = Recording(piece.x.astype(np.uint16), piece.y.astype(np.uint16), t_us + intake.time_offset_us, polarity)
+        yield _windowed(events, intake, report)
+
+
+def _check_values(path: Path, piece: Piece, width: int, height: int) -> None:
+    x, y, t_us = piece.x, piece.y, piece.t_us
+    wide, high = int(x.max()), int(y.max())
+    # One look at the extremes, and only where they are wrong a look at each.
+    if wide < width and high < height and int(x.min()) >= 0 and int(y.min()) >= 0 and _plausible(t_us):
+        return
+    swapped = f"; x reaches {wide} and y {high}: are they swapped?" if wide < height and high < width else ""
+    for name, column, wrong, expected in (
+        ("x", x, (x < 0) | (x >= width), f"0 to {width - 1}, the sensor width{swapped}"),
+        ("y", y, (y < 0) | (y >= height), f"0 to {height - 1}, the sensor height{swapped}"),
+        ("t", t_us, (t_us > _MAX_TIME_US) | (t_us < -_MAX_TIME_US), f"microseconds within ±{_MAX_TIME_US}"),
+    ):
+        if wrong.any():
+            k = int(wrong.argmax())
+            raise RecordingError(
+                f"{path}: {name} of {piece.place(k)} is {column[k]}, expected {expected} "
+                f"({np.count_nonzero(wrong):,} such of the {len(piece):,} events around it)"
+            )
+
+
+def _plausible(t_us: np.ndarray) -> bool:
+    return -_MAX_TIME_US <= int(t_us.min()) and int(t_us.max()) <= _MAX_TIME_US
+
+
+def _check_polarity(path: Path, piece: Piece, lowest: int, highest: int) -> None:
+    """Either 0 and 1 or -1 and 1, in the whole file."""
+    signed = lowest < 0
+    p = piece.polarity
+    wrong = (p != -1) & (p != 1) if signed else (p != 0) & (p != 1)
+    if lowest < -1 or highest > 1 or (signed and wrong.any()):
+        k = int(wrong.argmax()) if wrong.any() else 0
+        raise RecordingError(
+            f"{path}: polarity of {piece.place(k)} is {p[k]}, expected 0 (darker) and 1 (brighter), or -1 and 1, "
+            f"throughout; the file has {lowest} to {highest}"
+        )
+
+
+def _unwrapped(
+    t_us: Int64[np.ndarray, "events"], before_us: int | None, turned_us: int, report: IntakeReport
+) -> tuple[Int64[np.ndarray, "events"], int]:
+    """Times that run on where a counter of 31 or 32 bits began anew, which leaves no doubt at such values."""
+    late = np.flatnonzero(np.diff(t_us, prepend=t_us[0] if before_us is None else before_us) < 0)
+    for k in late.tolist():
+        before = int(t_us[k - 1]) if k else before_us
+        assert before is not None
+        for wrap_us in _WRAPS_US:
+            # A signed counter goes on at minus its range.
+            lowest = -wrap_us if wrap_us == 1 << 31 and t_us[k] - turned_us < 0 else 0
+            counted = before - turned_us
+            if 0 <= wrap_us - counted < _NEAR_US and 0 <= int(t_us[k]) - turned_us - lowest < _NEAR_US:
+                t_us[k:] += wrap_us - lowest
+                turned_us += wrap_us - lowest
+                report.repaired[f"times after the counter of {wrap_us.bit_length() - 1} bits began anew"] += 1
+                break
+    return t_us, turned_us
+
+
+def _check_order(
+    path: Path, piece: Piece, t_us: np.ndarray, before_us: int | None, intake: Intake, report: IntakeReport
+) -> None:
+    late = np.diff(t_us, prepend=t_us[0] if before_us is None else before_us) < 0
+    if not late.any():
+        return
+    k = int(late.argmax())
+    if intake.unsorted == "refuse":
+        before = int(t_us[k - 1]) if k else before_us
+        raise RecordingError(
+            f"{path}: {piece.place(k)} is at {t_us[k]} us, after one at {before} us; expected events in order of time "
+            f"({np.count_nonzero(late):,} such of the {len(piece):,} around it), or --unsorted sort to sort them"
+        )
+    report.repaired["events were earlier than the one before, and are sorted"] += int(np.count_nonzero(late))
+
+
+def _windowed(events: Recording, intake: Intake, report: IntakeReport) -> Recording:
+    if intake.start_us is None and intake.end_us is None:
+        return events
+    start_us = -_MAX_TIME_US if intake.start_us is None else intake.start_us
+    end_us = _MAX_TIME_US if intake.end_us is None else intake.end_us
+    inside = (events.t_us >= start_us) & (events.t_us <= end_us)
+    report.left_out["events outside the time window"] += int(len(events) - np.count_nonzero(inside))
+    return events.select(inside)
+
+
+def _sorted(pieces: Iterable[Recording], report: IntakeReport) -> Iterator[Recording]:
+    """All events by time, those of equal time in the order of the file; sorted pieces wait in a temporary file."""
+    with tempfile.TemporaryFile() as file:
+        ends = [0]
+        for piece in pieces:
+            run = np.empty(len(piece), _RUN)
+            for name in _RUN.names or ():
+                run[name] = getattr(piece, name)
+            file.write(run[np.argsort(run["t_us"], kind="stable")].tobytes())
+            ends.append(ends[-1] + len(run))
+        file.flush()
+        if not ends[-1]:
+            return
+        events = np.memmap(file, _RUN, "r")
+        runs = [events[begin:end] for begin, end in zip(ends, ends[1:], strict=False) if end > begin]
+        samples = np.sort(np.concatenate([run["t_us"][::_SAMPLE_EVERY] for run in runs]))
+        limits = [*np.unique(samples[:: _MERGED_AT_ONCE // _SAMPLE_EVERY])[1:].tolist(), None]
+        places = [0] * len(runs)
+        for limit in limits:
+            until = [len(run) if limit is None else int(np.searchsorted(run["t_us"], limit)) for run in runs]
+            merged = np.concatenate([run[a:b] for run, a, b in zip(runs, places, until, strict=True)])
+            merged = merged[np.argsort(merged["t_us"], kind="stable")]
+            places = until
+            yield Recording(*(np.ascontiguousarray(merged[name]) for name in ("x", "y", "t_us", "polarity")))
+
+
+def _filtered(
+    pieces: Iterable[Recording],
+    sensor_size: tuple[int, int],
+    intake: Intake,
+    hot: np.ndarray | None,
+    report: IntakeReport,
+) -> Iterator[Recording]:
+    """Without duplicates, hot pixels and events too soon, as far as asked for; pieces without events are left out."""
+    width, height = sensor_size
+    last_us = np.full(width * height, -_MAX_TIME_US)
+    last_polarity = np.zeros(width * height, np.int8)
+    for piece in pieces:
+        if hot is not None:
+            cold = ~hot[piece.pixels(width)]
+            report.left_out[f"events of {np.count_nonzero(hot)} hot pixels"] += int(len(cold) - np.count_nonzero(cold))
+            piece = piece.select(cold)  # noqa: PLW2901
+        if intake.duplicates == "drop" or intake.refractory_us:
+            columns = piece.pixels(width), piece.t_us, piece.polarity
+            why = _superfluous(*columns, last_us, last_polarity, intake.duplicates == "drop", intake.refractory_us)
+            report.left_out["events twice over"] += int(np.count_nonzero(why == 1))
+            report.left_out["events within the refractory time"] += int(np.count_nonzero(why == 2))
+            piece = piece.select(why == 0)  # noqa: PLW2901
+        if len(piece):
+            yield piece
+
+
+@njit(cache=True)
+def _superfluous(pixel, t_us, polarity, last_us, last_polarity, drop_equal, refractory_us):
+    """1 for an event like its pixel's last, 2 for one too soon after the last that is kept; those are remembered."""
+    why = np.zeros(len(pixel), np.int8)
+    for i in range(len(pixel)):
+        p = pixel[i]
+        if drop_equal and t_us[i] == last_us[p] and polarity[i] == last_polarity[p]:
+            why[i] = 1
+        elif t_us[i] - last_us[p] < refractory_us:
+            why[i] = 2
+        else:
+            last_us[p], last_polarity[p] = t_us[i], polarity[i]
+    return why
+
+
+def _write(output: Path, source: Path, pieces: Iterable[Recording], report: IntakeReport) -> None:
+    with whole_file(output) as temporary, h5py.File(temporary, "w") as file:
+        columns, offset_us, begun_ms = {}, 0, 0
+        for piece in pieces:
+            if not columns:
+                report.first_us = int(piece.t_us[0])
+                offset_us = report.first_us // 1000 * 1000
+                columns = {
+                    name: file.create_dataset(f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(_CHUNK,))
+                    for name, dtype in (("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1"))
+                }
+                # Long silences make long runs of one number.
+                columns["ms_to_idx"] = file.create_dataset(
+                    "ms_to_idx", (0,), "<u8", maxshape=(None,), chunks=(_CHUNK,), compression="gzip", compression_opts=1
+                )
+            t_us = piece.t_us - offset_us
+            if t_us[-1] >= _LONGEST_SPAN_US:
+                raise RecordingError(f"{source}: the events span {t_us[-1]} us, expected less than {_LONGEST_SPAN_US}")
+            # The milliseconds that begin after the last event before this piece, up to its own last one.
+            until_ms = int(t_us[-1]) // 1000 + 1
+            for first_ms in range(begun_ms, until_ms, _CHUNK):
+                milliseconds = np.arange(first_ms, min(first_ms + _CHUNK, until_ms))
+                _append(columns["ms_to_idx"], report.kept + np.searchsorted(t_us, 1000 * milliseconds))
+            begun_ms = until_ms
+            for name, values in (("x", piece.x), ("y", piece.y), ("t", t_us), ("p", piece.polarity > 0)):
+                _append(columns[name], values)
+            report.kept += len(piece)
+            report.last_us = int(piece.t_us[-1])
+        if not report.kept:
+            raise RecordingError(f"{source}: no event is left of {report.read:,}, expected some")
+        _append(columns["ms_to_idx"], np.array([report.kept]))
+        file["t_offset"] = np.int64(offset_us)
+
+
+def _append(column: h5py.Dataset, values: np.ndarray) -> None:
+    column.resize((len(column) + len(values),))
+    column[len(column) - len(values) :] = values

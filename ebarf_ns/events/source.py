@@ -1,0 +1,49 @@
+"""A recording of any format as its reader hands it on: what the header says, and the events piece by piece."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Int64, Shaped
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some events in the file's order; that they are integers is all that is sure of them."""
+
+    x: Shaped[np.ndarray, "events"]
+    y: Shaped[np.ndarray, "events"]
+    t_us: Int64[np.ndarray, "events"]
+    polarity: Shaped[np.ndarray, "events"]
+    """As the file has it: 0 and 1, or -1 and 1."""
+    place: Callable[[int], str]
+    """Where in the file an event of this piece is, for people."""
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording that can be read once, from beginning to end, a piece at a time."""
+
+    path: Path
+    format: str
+    """What it was recognised as, for people."""
+    sensor_size: tuple[int, int] | None
+    """Columns and rows, where the file says so."""
+    pieces: Iterator[Piece]
+    dropped: Counter[str] = field(default_factory=Counter)
+    """Events that the file hints at but does not hold in full, by reason; counted while reading."""
+
+
+def numbered(first: int, word: str = "event") -> Callable[[int], str]:
+    """A :attr:`Piece.place` that counts from ``first``."""
+    return lambda k: f"{word} {first + k:,}"

@@ -1,0 +1,201 @@
+"""Where datasets keep what: from a folder as it was downloaded to the ingredients of a scene."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ebarf_ns.calibration import Calibrated, pose_matrix, read_calibration
+from ebarf_ns.errors import SceneError
+from ebarf_ns.events.readers.arrays import read_npy_folder, read_npz
+from ebarf_ns.events.readers.hdf5 import read_hdf5
+from ebarf_ns.events.readers.text import read_text
+from ebarf_ns.events.source import Source
+from ebarf_ns.geometry.cameras import Camera
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
+from ebarf_ns.scene import ContrastThreshold, FrameIntensity
+
+Layout = Literal["ecd", "tumvie", "eds", "esim", "robust-e-nerf"]
+_EVENT_CAMERAS = {"left": "2", "right": "3"}
+_GREY_CAMERAS = {"left": "0", "right": "1"}
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """A picture that a camera took, where the dataset has it."""
+
+    path: Path
+    t_us: int
+    camera: Camera
+    event_camera_from_frame_camera: np.ndarray
+    intensity: FrameIntensity
+
+
+@dataclass(frozen=True)
+class Ingredients:
+    """What a dataset's folder has for a scene."""
+
+    open_events: Callable[[], Source]
+    camera: Camera | None = None
+    groundtruth: Trajectory | None = None
+    frames: tuple[FrameFile, ...] = ()
+    contrast_threshold: ContrastThreshold | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def ecd(folder: Path, sensor_size: tuple[int, int] = (240, 180)) -> Ingredients:
+    """The event camera dataset (Mueggler et al. 2017): events.txt, calib.txt, groundtruth.txt, images.txt."""
+    camera = read_calibration(folder / "calib.txt", sensor_size=sensor_size).camera
+    groundtruth, notes = None, []
+    if (folder / "groundtruth.txt").is_file():
+        groundtruth, notes = read_trajectory(folder / "groundtruth.txt", TrajectoryFormat("s", "xyzw"))
+    # The DAVIS' frames are linear up to its sensor's offset.
+    frames = tuple(
+        FrameFile(path, t_us, camera, np.eye(4), "linear") for t_us, path in _listed(folder / "images.txt", "s")
+    )
+    return Ingredients(lambda: read_text(folder / "events.txt", "s"), camera, groundtruth, frames, notes=notes)
+
+
+def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) -> Ingredients:
+    """TUM-VIE (Klenk et al. 2021): ``*events_left.h5``, mocap_data.txt and the calibrations A or B beside them.
+
+    The marker's poses become the event camera's by T_mocap_marker · T_imu_marker⁻¹ · T_imu_cam.
+    """
+    events = _only(folder, f"*events_{side}.h5")
+    cameras = calibration or _only(folder, "camera-calibration*.json")
+    marker = cameras.parent / f"mocap-imu-{cameras.name.removeprefix('camera-')}"
+    event_camera = read_calibration(cameras, _EVENT_CAMERAS[side])
+    grey_camera = read_calibration(cameras, _GREY_CAMERAS[side])
+    groundtruth, notes = None, []
+    mocap = _at_most_one(folder, "**/mocap_data.txt")
+    if mocap and marker.is_file():
+        marker_path, notes = read_trajectory(mocap, TrajectoryFormat("us", "xyzw"))
+        imu_from_marker = pose_matrix(json.loads(marker.read_text(encoding="utf-8"))["value0"]["T_imu_marker"])
+        groundtruth = _moved(marker_path, np.linalg.inv(imu_from_marker) @ _rig(event_camera, cameras))
+    elif mocap:
+        notes.append(f"{mocap.name} is left out: it has poses of a marker, and {marker.name}, which relates it, is missing")
+    event_from_grey = np.linalg.inv(_rig(event_camera, cameras)) @ _rig(grey_camera, cameras)
+    frames = []
+    for stamps in folder.glob(f"**/image_timestamps_{side}.txt"):
+        images = sorted((stamps.parent / f"{side}_images").glob("*.jpg"))
+        times = _times(stamps, len(images))
+        frames = [
+            FrameFile(path, t_us, grey_camera.camera, event_from_grey, "srgb")
+            for path, t_us in zip(images, times, strict=True)
+        ]
+    return Ingredients(lambda: read_hdf5(events, "events"), event_camera.camera, groundtruth, tuple(frames), notes=notes)
+
+
+def eds(folder: Path) -> Ingredients:
+    """EDS (Hidalgo-Carrió et al. 2022): events.h5 with its columns at top level, poses of the event camera."""
+    groundtruth, notes = None, []
+    poses = folder / "stamped_groundtruth.txt"
+    if poses.is_file():
+        groundtruth, notes = read_trajectory(poses, TrajectoryFormat("s", "xyzw"))
+    notes.append("the frames are another camera's, whose place no file in the folder says: they are left out")
+    return Ingredients(lambda: read_hdf5(folder / "events.h5"), None, groundtruth, notes=notes)
+
+
+def esim(folder: Path) -> Ingredients:
+    """ESIM's and E-NeRF's synthetic recordings: events/*.npy, *poses_all*.txt (ns), images with image_stamps_ns.txt."""
+    groundtruth, notes = None, []
+    poses = _at_most_one(folder, "**/*poses_all*.txt")
+    if poses:
+        groundtruth, notes = read_trajectory(poses, TrajectoryFormat("ns", "xyzw"))
+    events = folder / "events" if (folder / "events").is_dir() else folder
+    return Ingredients(lambda: read_npy_folder(events), None, groundtruth, notes=notes)
+
+
+def robust_e_nerf(folder: Path) -> Ingredients:
+    """Robust e-NeRF (Low & Lee 2023): raw_events.npz, camera_poses.npz, camera_calibration.npz."""
+    calibration = folder / "camera_calibration.npz"
+    camera = read_calibration(calibration).camera
+    with np.load(calibration, allow_pickle=False) as file:
+        on, off = (float(file[f"{sign}_contrast_threshold"]) for sign in ("pos", "neg"))
+    groundtruth, notes = read_trajectory(folder / "camera_poses.npz")
+    return Ingredients(
+        lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, (), ContrastThreshold(on, off), notes
+    )
+
+
+LAYOUTS: dict[Layout, Callable[..., Ingredients]] = {
+    "ecd": ecd, "tumvie": tumvie, "eds": eds, "esim": esim, "robust-e-nerf": robust_e_nerf
+}  # fmt: skip
+
+
+def recognised_layout(folder: Path) -> Layout:
+    """By the files in a folder; raises :class:`SceneError`."""
+    marks: dict[Layout, str] = {
+        "ecd": "events.txt", "tumvie": "*events_*.h5", "eds": "events.h5", "robust-e-nerf": "raw_events.npz",
+        "esim": "events/*.npy",
+    }  # fmt: skip
+    found = [layout for layout, mark in marks.items() if any(folder.glob(mark))]
+    if len(found) != 1:
+        raise SceneError(
+            f"{folder}: looks like {' and '.join(found) or 'none'} of the datasets known; expected one of "
+            f"{', '.join(f'{layout} ({mark})' for layout, mark in marks.items())}, or the recording's file"
+        )
+    return found[0]
+
+
+def _moved(trajectory: Trajectory, body_from_camera: np.ndarray) -> Trajectory:
+    """The poses of a camera that is fixed to the body whose poses these are."""
+    turn = Rotation.from_matrix(body_from_camera[:3, :3]).as_quat()[[3, 0, 1, 2]]
+    count = len(trajectory.t_us)
+    local = Poses(torch.from_numpy(body_from_camera[:3, 3]).expand(count, 3), torch.from_numpy(turn).expand(count, 4))
+    return Trajectory(trajectory.t_us, trajectory.poses.compose(local))
+
+
+def _rig(camera: Calibrated, path: Path) -> np.ndarray:
+    if camera.rig_from_camera is None:
+        raise SceneError(f"{path}: does not say where the cameras are on the rig, expected T_imu_cam")
+    return camera.rig_from_camera
+
+
+def _only(folder: Path, pattern: str) -> Path:
+    found = _at_most_one(folder, pattern)
+    if found is None:
+        raise SceneError(f"{folder}: holds no {pattern}, expected the dataset's folder as it was downloaded")
+    return found
+
+
+def _at_most_one(folder: Path, pattern: str) -> Path | None:
+    found = sorted(folder.glob(pattern))
+    if len(found) > 1:
+        raise SceneError(f"{folder}: holds {len(found)} files {pattern}, expected one: {', '.join(p.name for p in found)}")
+    return found[0] if found else None
+
+
+def _listed(path: Path, unit: Literal["s", "us"]) -> list[tuple[int, Path]]:
+    """Lines "time file"."""
+    images = []
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    for number, line in enumerate(lines, start=1):
+        fields = line.split()
+        if not fields or line.startswith("#"):
+            continue
+        try:
+            t_us = round(float(fields[0]) * (1e6 if unit == "s" else 1))
+        except ValueError:
+            t_us = None
+        if t_us is None or len(fields) != 2 or not (path.parent / fields[1]).is_file():
+            raise SceneError(f"{path}:{number}: {line!r:.60}, expected 't[{unit}] file' with an existing file")
+        images.append((t_us, path.parent / fields[1]))
+    return images
+
+
+def _times(path: Path, count: int) -> list[int]:
+    """A time in microseconds a line, after a line of names."""
+    lines = [line.split()[0] for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    lines = [line for line in lines if not line.startswith("#") and line.replace(".", "").isdigit()]
+    if len(lines) != count:
+        raise SceneError(f"{path}: {len(lines)} times, expected one for each of the {count} images")
+    return [round(float(line)) for line in lines]

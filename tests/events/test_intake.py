@@ -1,0 +1,128 @@
+"""Nothing is lost in silence on the way into a scene."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ebarf_ns.errors import RecordingError
+from ebarf_ns.events import intake as intake_module
+from ebarf_ns.events.intake import Intake, IntakeReport, hot_pixels, take_in
+from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.events.source import Piece, Source, numbered
+from tests.events import writers
+
+SIZE = (24, 18)
+
+
+def source(events: Sequence[writers.Event], piece: int = 7) -> Source:
+    def pieces():
+        for first in range(0, len(events), piece):
+            t, x, y, p = (np.array(c, np.int64) for c in zip(*events[first : first + piece], strict=True))
+            yield Piece(x, y, t, p, numbered(first))
+
+    return Source(Path("camera.bin"), "a test", SIZE, pieces(), Counter())
+
+
+def taken(folder: Path, events: Sequence[writers.Event], **intake: object) -> tuple[Recording, IntakeReport]:
+    report = take_in(source(events), SIZE, Intake(**intake), folder / "events.h5")  # pyright: ignore[reportArgumentType]
+    return read_recording(folder / "events.h5", *SIZE), report
+
+
+EVENT = st.tuples(st.integers(-5000, 5000), st.integers(0, 23), st.integers(0, 17), st.integers(0, 1))
+
+
+@settings(deadline=None)
+@given(st.lists(EVENT, min_size=1).map(sorted), st.integers(1, 9))
+def test_events_in_order_arrive_as_they_are(tmp_path_factory: pytest.TempPathFactory, events: list, piece: int):
+    path = tmp_path_factory.mktemp("intake") / "events.h5"
+    report = take_in(source(events, piece), SIZE, Intake(), path)
+    back, expected = read_recording(path, *SIZE), writers.recording(events)
+    for column in ("x", "y", "t_us", "polarity"):
+        assert np.array_equal(getattr(back, column), getattr(expected, column))
+    assert report.read == report.kept == len(events) and not report.left_out and not report.repaired
+    with h5py.File(path) as file:
+        times, index = np.asarray(file["events/t"]), np.asarray(file["ms_to_idx"])
+        assert len(index) == times[-1] // 1000 + 2
+        for millisecond, first in enumerate(index):
+            assert (times[first:] >= millisecond * 1000).all() and (times[:first] < millisecond * 1000).all()
+
+
+@settings(deadline=None)
+@given(st.lists(EVENT, min_size=1), st.integers(1, 9))
+def test_sorting_is_stable_and_loses_nothing(tmp_path_factory: pytest.TempPathFactory, events: list, piece: int):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(intake_module, "_MERGED_AT_ONCE", 4)
+        patch.setattr(intake_module, "_SAMPLE_EVERY", 2)
+        path = tmp_path_factory.mktemp("intake") / "events.h5"
+        report = take_in(source(events, piece), SIZE, Intake(unsorted="sort"), path)
+    expected = writers.recording(sorted(events, key=lambda event: event[0]))
+    back = read_recording(path, *SIZE)
+    for column in ("x", "y", "t_us", "polarity"):
+        assert np.array_equal(getattr(back, column), getattr(expected, column))
+    assert bool(report.repaired) == (events != sorted(events, key=lambda event: event[0]))
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ((50, 24, 1, 1), "x of event 2 is 24, expected 0 to 23, the sensor width"),
+        ((50, 1, 18, 1), "y of event 2 is 18, expected 0 to 17, the sensor height"),
+        ((50, -1, 1, 1), "x of event 2 is -1"),
+        ((50, 1, 1, 2), "polarity of event 2 is 2, expected 0 (darker) and 1 (brighter)"),
+        ((50, 1, 1, -1), "expected 0 (darker) and 1 (brighter), or -1 and 1, throughout"),
+        ((5, 1, 1, 1), "event 2 is at 5 us, after one at 20 us; expected events in order of time"),
+        ((1 << 62, 1, 1, 1), "t of event 2 is"),
+    ],
+)
+def test_what_cannot_be_an_event_is_named(tmp_path: Path, event: writers.Event, words: str):
+    with pytest.raises(RecordingError) as caught:
+        taken(tmp_path, [(10, 1, 1, 0), (20, 1, 1, 1), event, (60, 1, 1, 1)])
+    assert words in str(caught.value) and "camera.bin" in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_swapped_columns_are_suspected(tmp_path: Path):
+    with pytest.raises(RecordingError, match="are they swapped"):
+        taken(tmp_path, [(1, 3, 20, 1), (2, 4, 22, 1)])
+
+
+def test_signed_polarities(tmp_path: Path):
+    back, _ = taken(tmp_path, [(1, 3, 2, -1), (2, 4, 2, 1)])
+    assert back.polarity.tolist() == [-1, 1]
+
+
+@pytest.mark.parametrize(("before", "after"), [((1 << 32) - 4, 3), ((1 << 31) - 4, 3), ((1 << 31) - 4, 3 - (1 << 31))])
+def test_counters_that_begin_anew_run_on(tmp_path: Path, before: int, after: int):
+    back, report = taken(tmp_path, [(before - 10, 1, 1, 0), (before, 1, 1, 0), (after, 1, 1, 0), (after + 9, 1, 1, 1)])
+    assert np.diff(back.t_us).tolist() == [10, 7, 9] and sum(report.repaired.values()) == 1
+
+
+def test_each_thing_left_out_is_counted(tmp_path: Path):
+    events = [(t, 5, 5, t % 2) for t in range(0, 4000, 10)] + [(4000, 1, 1, 1), (4000, 1, 1, 1), (4005, 1, 1, 0)]
+    events += [(5000 + k, k % 24, k % 18, 1) for k in range(200)] + [(9000, 2, 2, 1)]
+    hot = hot_pixels(source(events), SIZE, Intake(), 10)
+    assert hot.reshape(18, 24)[5, 5] and hot.sum() == 1
+    intake = Intake(duplicates="drop", refractory_us=8, end_us=8000, time_offset_us=0)
+    report = take_in(source(events), SIZE, intake, tmp_path / "events.h5", hot)
+    assert report.left_out == {
+        "events outside the time window": 1, "events of 1 hot pixels": 403, "events twice over": 1,
+        "events within the refractory time": 1,
+    }  # fmt: skip
+    assert report.kept == len(events) - 406 and report.read == len(events)
+    assert any("left out: 403" in sentence for sentence in report.sentences())
+
+
+def test_the_clock_can_be_moved(tmp_path: Path):
+    back, _ = taken(tmp_path, [(10, 1, 1, 0), (20, 1, 1, 1)], time_offset_us=10**15)
+    assert back.t_us.tolist() == [10**15 + 10, 10**15 + 20]
+
+
+def test_nothing_left_is_an_error(tmp_path: Path):
+    with pytest.raises(RecordingError, match="no event is left of 2"):
+        taken(tmp_path, [(10, 1, 1, 0), (20, 1, 1, 1)], start_us=100)

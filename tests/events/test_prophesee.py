@@ -1,0 +1,113 @@
+"""EVT2, EVT2.1, EVT3 and DAT against writers of their own, and against a real camera's file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.readers.prophesee import Decoder, read_dat, read_raw
+from tests.conftest import DATA
+from tests.events import writers
+
+ENCODERS = {"evt2": writers.evt2, "evt2.1": writers.evt21, "evt3": writers.evt3}
+EVENTS = st.lists(
+    st.tuples(st.integers(0, 2**24 - 1), st.integers(0, 639), st.integers(0, 479), st.integers(0, 1)), min_size=1
+).map(sorted)
+
+
+def columns(decoder: Decoder, content: bytes, size: int) -> list[np.ndarray]:
+    parts = [decoder.feed(content[k : k + size]) for k in range(0, len(content), size)]
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
+@pytest.mark.parametrize("encoding", list(ENCODERS))
+@settings(deadline=None)
+@given(events=EVENTS, size=st.integers(1, 40))
+def test_what_is_written_is_read_in_pieces_of_any_size(encoding, events: list[writers.Event], size: int):
+    content = ENCODERS[encoding](events)
+    whole = columns(Decoder(encoding), content, len(content))
+    assert [whole[2].tolist(), whole[0].tolist(), whole[1].tolist(), whole[3].tolist()] == [
+        list(column) for column in zip(*events, strict=True)
+    ]
+    for one, again in zip(whole, columns(Decoder(encoding), content, size), strict=True):
+        assert np.array_equal(one, again)
+
+
+@pytest.mark.parametrize("encoding", list(ENCODERS))
+def test_time_runs_on_where_its_counter_begins_anew(encoding):
+    bits = 24 if encoding == "evt3" else 34
+    # As cameras do, with time words now and then.
+    times = [*range((1 << bits) - 3 * (1 << (bits - 3)), (1 << bits) + 3 * (1 << (bits - 3)), 1 << (bits - 3))]
+    content = ENCODERS[encoding]([(t, 1, 2, 1) for t in times])
+    assert Decoder(encoding).feed(content)[2].tolist() == times
+
+
+def test_halves_of_evt21_words_may_be_swapped(tmp_path: Path):
+    events = [(100, 3, 4, 1), (100, 5, 4, 1), (200, 600, 400, 0)]
+    swapped = writers.raw(tmp_path / "a.raw", "2.1", writers.evt21(events, swapped=True))
+    (piece,) = read_raw(swapped).pieces
+    assert piece.x.tolist() == [3, 5, 600] and piece.t_us.tolist() == [100, 100, 200]
+    straight = tmp_path / "b.raw"
+    straight.write_bytes(b"% evt 2.1\n% endianness little\n% end\n" + writers.evt21(events))
+    (piece,) = read_raw(straight).pieces
+    assert piece.x.tolist() == [3, 5, 600]
+
+
+def test_events_without_a_time_are_counted_and_left_out():
+    decoder = Decoder("evt3")
+    assert not len(decoder.feed(np.array([0x0005, 0x2801, 0x2802], "<u2").tobytes())[0]) and decoder.timeless == 2
+
+
+@pytest.mark.parametrize(("encoding", "word"), [("evt2", "<u4"), ("evt2.1", "<u8"), ("evt3", "<u2")])
+def test_a_word_of_no_known_kind_is_named(tmp_path: Path, encoding: str, word: str):
+    bits = np.dtype(word).itemsize * 8
+    content = np.array([0x8 << (bits - 4), 0xB << (bits - 4)], word)
+    if encoding == "evt2.1":
+        content = (content << np.uint64(32)) | (content >> np.uint64(32))
+    path = writers.raw(tmp_path / "a.raw", encoding.removeprefix("evt"), content.tobytes())
+    with pytest.raises(RecordingError, match="word 1 is 0xb"):
+        list(read_raw(path).pieces)
+
+
+def test_a_cut_word_is_counted(tmp_path: Path):
+    path = writers.raw(tmp_path / "a.raw", "2.0", writers.evt2([(1, 2, 3, 1), (2, 2, 3, 1)])[:-1])
+    source = read_raw(path)
+    assert sum(len(piece) for piece in source.pieces) == 1
+    assert source.dropped["words cut short by the end of the file"] == 1
+
+
+@pytest.mark.parametrize("header", ["% evt 4.0\n", "% Date today\n", ""])
+def test_an_unknown_encoding_is_named(tmp_path: Path, header: str):
+    path = tmp_path / "a.raw"
+    path.write_bytes(header.encode() + bytes(64))
+    with pytest.raises(RecordingError, match="expected EVT2, EVT2.1 or EVT3"):
+        read_raw(path)
+
+
+@settings(deadline=None)
+@given(events=EVENTS)
+def test_dat_reads_back(tmp_path_factory: pytest.TempPathFactory, events: list[writers.Event]):
+    source = read_dat(writers.dat(tmp_path_factory.mktemp("dat") / "a.dat", events))
+    (piece,) = source.pieces
+    assert source.sensor_size == (640, 480)
+    assert list(zip(piece.t_us, piece.x, piece.y, piece.polarity, strict=True)) == events
+
+
+def test_dat_runs_on_after_32_bits(tmp_path: Path):
+    times = [(1 << 32) - 5, (1 << 32) + 5, (1 << 32) + 2**31]
+    (piece,) = read_dat(writers.dat(tmp_path / "a.dat", [(t, 1, 1, 1) for t in times])).pieces
+    assert piece.t_us.tolist() == times
+
+
+def test_a_real_camera():
+    path = DATA / "readers" / "prophesee_evt2.raw"
+    if not path.is_file():
+        pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")
+    pieces = list(read_raw(path).pieces)
+    assert sum(map(len, pieces)) == 521_252 and 913.6e6 < pieces[0].t_us[0] < 913.8e6
+    assert max(int(piece.x.max()) for piece in pieces) < 640 and max(int(piece.y.max()) for piece in pieces) < 480
+    t_us = np.concatenate([piece.t_us for piece in pieces])
+    assert (np.diff(t_us) >= 0).all()
