@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -30,11 +30,13 @@ _GREY_CAMERAS = {"left": "0", "right": "1"}
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A picture that a camera took, where the dataset has it."""
+    """A picture that a camera took."""
 
-    path: Path
+    picture: Path | np.ndarray
+    """A file, or 8-bit grey."""
     t_us: int
-    camera: Camera
+    camera: Camera | None
+    """None: the event camera itself."""
     event_camera_from_frame_camera: np.ndarray
     intensity: FrameIntensity
 
@@ -46,7 +48,7 @@ class Ingredients:
     open_events: Callable[[], Source]
     camera: Camera | None = None
     groundtruth: Trajectory | None = None
-    frames: tuple[FrameFile, ...] = ()
+    frames: Iterable[FrameFile] = ()
     contrast_threshold: ContrastThreshold | None = None
     notes: list[str] = field(default_factory=list)
 

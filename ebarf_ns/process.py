@@ -6,7 +6,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -16,10 +16,11 @@ import torch
 
 from ebarf_ns.calibration import read_calibration
 from ebarf_ns.errors import SceneError, TrajectoryError
-from ebarf_ns.evaluation.conventions import read_by_reference
+from ebarf_ns.evaluation.compare import read_by_reference
 from ebarf_ns.events.intake import Intake, hot_pixels, take_in
 from ebarf_ns.events.readers.text import TimeUnit
-from ebarf_ns.events.recognise import RecordingFormat, open_recording
+from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised
+from ebarf_ns.events.source import Source
 from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
@@ -110,7 +111,26 @@ def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ing
             return LAYOUTS[layout](source, settings.sensor_size)
         return LAYOUTS[layout](source)
     known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]
-    return Ingredients(lambda: open_recording(source, known, settings.part, settings.event_time_unit))
+    known = known or recognised(source)
+    opened = lambda: open_recording(source, known, settings.part, settings.event_time_unit)  # noqa: E731
+    return Ingredients(opened, frames=_frames_within(source, known, opened) if settings.frames else ())
+
+
+def _frames_within(source: Path, format: RecordingFormat, opened: Callable[[], Source]) -> Iterator[FrameFile]:
+    """The pictures that a DAVIS takes with the pixels of its events."""
+    if format == "aedat4":
+        from ebarf_ns.events.readers.aedat4 import read_aedat4_frames
+
+        pictures = read_aedat4_frames(source)
+    elif format == "bag":
+        from ebarf_ns.events.readers.bags import read_bag_frames
+
+        pictures = read_bag_frames(source, opened().sensor_size or (0, 0))
+    else:
+        return
+    for t_us, picture in pictures:
+        grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+        yield FrameFile(grey, t_us, None, np.eye(4), "linear")
 
 
 def _assemble(
@@ -139,21 +159,26 @@ def _assemble(
         groundtruth = _clipped(groundtruth, span_us, settings.groundtruth or source.path)
         write_tum(folder / "groundtruth.txt", groundtruth)
     threshold = ContrastThreshold(*settings.contrast_threshold) if settings.contrast_threshold else None
-    frames = [frame for frame in ingredients.frames if settings.frames and span_us[0] <= frame.t_us <= span_us[1]]
+    frames, seen = [], 0
+    for frame in ingredients.frames if settings.frames else ():
+        frame = replace(frame, t_us=frame.t_us + intake.time_offset_us)  # noqa: PLW2901
+        if span_us[0] <= frame.t_us <= span_us[1]:
+            frames.append(_taken_along(frame, f"{seen:06d}", camera, folder))
+        seen += 1
     scene = Scene(
         folder=folder,
         events=folder / "events.h5",
         trajectory=folder / "trajectory.txt",
         camera=camera,
         groundtruth=folder / "groundtruth.txt" if groundtruth is not None else None,
-        frames=tuple(_taken_along(frame, folder) for frame in frames),
+        frames=tuple(frames),
         contrast_threshold=threshold or ingredients.contrast_threshold,
         bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
     )
     write_scene(scene)
     notes.append(
         f"{len(initial.t_us)} keyframes around the events, "
-        f"{len(frames)} of {len(ingredients.frames)} frames within their span"
+        f"{len(frames)} of {seen} frames within their span"
     )
     return report.sentences() + notes
 
@@ -206,17 +231,18 @@ def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tupl
     return tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
 
 
-def _taken_along(frame: FrameFile, folder: Path) -> Frame:
+def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> Frame:
     """A copy: PNG where the scene can hold it as it is."""
-    path = folder / "frames" / f"{frame.path.stem}.png"
+    picture = frame.picture
+    name = picture.stem if isinstance(picture, Path) else name
+    path = folder / "frames" / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
-    if frame.path.suffix.lower() == ".png":
-        path.write_bytes(frame.path.read_bytes())
+    if isinstance(picture, Path) and picture.suffix.lower() == ".png":
+        path.write_bytes(picture.read_bytes())
     else:
-        image = cv2.imread(str(frame.path), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE) if isinstance(picture, Path) else picture
         if image is None:
-            raise SceneError(f"{frame.path}: not a readable image")
+            raise SceneError(f"{picture}: not a readable image")
         cv2.imwrite(str(path), image)
     extrinsic = tuple(map(tuple, np.asarray(frame.event_camera_from_frame_camera, float).tolist()))
-    return Frame(path, frame.t_us, frame.camera, extrinsic, frame.intensity)
-
+    return Frame(path, frame.t_us, frame.camera or camera, extrinsic, frame.intensity)

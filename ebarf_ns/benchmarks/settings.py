@@ -19,3 +19,13 @@ class EngineBenchmark:
     """Of the trainings on the demo scene."""
     seconds: float = 100.0
     """Training time of each."""
+
+
+@dataclass(frozen=True)
+class RecordingsBenchmark:
+    """How much to write and read."""
+
+    events: int = 20_000_000
+    """Of the HDF5 file; of the other formats, a tenth."""
+    huge: int = 200_000_000
+    """Events of the file by which memory is measured; 0: none."""

@@ -11,8 +11,9 @@ import yaml
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from ebarf_ns.benchmarks.settings import EngineBenchmark
+from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.errors import EbarfError, one_line_errors
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
 from ebarf_ns.process import Format, ProcessSettings
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
@@ -81,37 +82,63 @@ class Process:
 
 @dataclass
 class Inspect:
-    """What is in a scene folder, and what looks wrong in it."""
+    """What is in a scene folder, or in a recording of any format, and what looks wrong in it."""
 
     scene: tyro.conf.Positional[Path]
+    """A scene folder, or a recording."""
+    picture: Path | None = None
+    """Of a recording: a PNG to make, with the events of some moments."""
+    part: str | None = None
+    """Of a recording: the group of an HDF5 file or the topic of a bag that has the events, where several have."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Print the summary."""
+        if not (self.scene / "scene.json").exists() and (self.scene.is_file() or (self.scene / "metadata.yaml").exists()):
+            summary = self._recording()
+        else:
+            summary = self._scene()
+        if self.json:
+            _print_json(asdict(summary))
+
+    def _recording(self) -> Any:
+        from ebarf_ns.events.recognise import open_recording
+        from ebarf_ns.raw_inspection import contact_sheet, inspect_recording, print_raw_summary
+
+        opened = lambda: open_recording(self.scene, part=self.part)  # noqa: E731
+        summary = inspect_recording(opened)
+        if self.picture:
+            contact_sheet(opened, summary, self.picture)
+        if not self.json:
+            print_raw_summary(summary, self.scene)
+        return summary
+
+    def _scene(self) -> Any:
         from ebarf_ns.inspection import inspect_scene, print_summary
 
         summary = inspect_scene(self.scene)
-        if self.json:
-            _print_json(asdict(summary))
-        else:
+        if not self.json:
             print_summary(summary, self.scene)
+        return summary
 
 
 @dataclass
 class TrajectoryCompare:
-    """Errors of a trajectory against a reference, both TUM files."""
+    """Errors of a trajectory against a reference, in any of the formats that ebarf process reads."""
 
     estimate: tyro.conf.Positional[Path]
     reference: tyro.conf.Positional[Path]
+    known: tyro.conf.OmitArgPrefixes[TrajectoryFormat] = field(default_factory=TrajectoryFormat)
+    """What the estimate's file does not say of itself."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Print the errors under each alignment."""
-        from ebarf_ns.evaluation.trajectory_error import compare_files
+        from ebarf_ns.evaluation.compare import compare_files
 
-        comparison = compare_files(self.estimate, self.reference)
+        comparison = compare_files(self.estimate, self.reference, self.known)
         if self.json:
             _print_json(comparison)
         else:
@@ -184,24 +211,28 @@ class Trajectory:
 
 @dataclass
 class Bench:
-    """Measure: engine is our speed beside nerfstudio's; a manifest is a comparison of methods, error against run time.
+    """Measure: engine is our speed beside nerfstudio's; recordings is how fast recordings are read; a manifest is a
+    comparison of methods, error against run time.
 
     A comparison can be stopped, and goes on where it stopped.
     """
 
     what: tyro.conf.Positional[str]
-    """engine, or a manifest such as configs/benchmarks/shipped.yaml."""
+    """engine, recordings, or a manifest such as configs/benchmarks/shipped.yaml."""
     engine: tyro.conf.OmitArgPrefixes[EngineBenchmark] = field(default_factory=EngineBenchmark)
     """What to measure of the engine."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordingsBenchmark] = field(default_factory=RecordingsBenchmark)
+    """How much to read."""
     output: Path | None = None
-    """Of the engine: a JSON file for its figures. Of a comparison: the folder for scenes, runs, records and diagrams;
+    """Of engine and recordings: a JSON file for the figures. Of a comparison: the folder for scenes, runs, records and diagrams;
     where not given, bench/ and the manifest's name."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Measure, print, and keep."""
-        result, shown = self._engine() if self.what == "engine" else self._comparison()
+        measure = {"engine": self._engine, "recordings": self._recordings}.get(self.what, self._comparison)
+        result, shown = measure()
         if self.json:
             _print_json(result)
         else:
@@ -211,6 +242,15 @@ class Bench:
         from ebarf_ns.benchmarks.engine import run_engine_benchmark, table, write
 
         result = run_engine_benchmark(self.engine, _stderr.print)
+        if self.output:
+            write(result, self.output)
+        return result, table(result)
+
+    def _recordings(self) -> tuple[dict[str, Any], str]:
+        from ebarf_ns.benchmarks.engine import table, write
+        from ebarf_ns.benchmarks.recordings import run_recordings_benchmark
+
+        result = run_recordings_benchmark(self.recordings, _stderr.print)
         if self.output:
             write(result, self.output)
         return result, table(result)

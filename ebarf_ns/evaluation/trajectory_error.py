@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,13 +17,12 @@ from torch import Tensor
 from ebarf_ns.errors import EvaluationError
 from ebarf_ns.geometry.so3 import quat_wxyz_multiply, rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
-from ebarf_ns.geometry.trajectory_file import read_tum
 
 # Motion across the main direction below this share of that along it counts as a line.
 _THINNEST = 0.01
 _ALTERNATIONS = 20
 Alignment = Literal["se3", "sim3", "orientation"]
-_SUFFIXES: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
+ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
 """How results say which alignment a number is of."""
 
 
@@ -181,41 +179,24 @@ def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str,
 
     Rotations have an error wherever 3 poses match, also about a camera that stays where it is.
     """
-    errors, _ = _under_each_alignment(estimate, reference)
+    errors, _ = errors_under_each_alignment(estimate, reference)
     try:
         rotation_deg, _ = rotation_errors_deg(estimate, reference)
     except EvaluationError:
         rotation_deg = None
     results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": rotation_deg}
-    for alignment, suffix in _SUFFIXES.items():
+    for alignment, suffix in ALIGNMENTS.items():
         error = errors.get(alignment)
         results |= {f"ate_m{suffix}": error and error.ate_m, f"scale{suffix}": error and error.scale}
     return {**results, "ape_full": errors["se3"].ape_full if "se3" in errors else None}
 
 
-def compare_files(estimate: Path, reference: Path) -> dict[str, Any]:
-    """The errors of a TUM file against another under every alignment that is defined for them.
-
-    Raises :class:`EvaluationError` where none is.
-    """
-    errors, reasons = _under_each_alignment(read_tum(estimate), read_tum(reference))
-    if not errors:
-        raise EvaluationError(f"{estimate}: {next(iter(reasons.values()))}")
-    comparison: dict[str, Any] = {alignment: None for alignment in _SUFFIXES}
-    for alignment, error in errors.items():
-        comparison[alignment] = vars(error).copy()
-        comparison["matched"] = comparison[alignment].pop("matched")
-    notes = [f"{path.name}: seconds, quaternions x y z w, as TUM has them" for path in (estimate, reference)]
-    notes += [f"{alignment}: {reason}" for alignment, reason in reasons.items()]
-    return {**comparison, "scale": errors["sim3"].scale if "sim3" in errors else None, "notes": notes}
-
-
-def _under_each_alignment(
+def errors_under_each_alignment(
     estimate: Trajectory, reference: Trajectory
 ) -> tuple[dict[Alignment, TrajectoryError], dict[Alignment, str]]:
     """The errors where an alignment is defined, and where it is not the reason."""
     errors, reasons = {}, {}
-    for alignment in _SUFFIXES:
+    for alignment in ALIGNMENTS:
         try:
             errors[alignment] = trajectory_error(estimate, reference, alignment)
         except EvaluationError as problem:

@@ -27,7 +27,7 @@ def open_recording(
 
     Raises :class:`RecordingError` where it cannot be opened or is none.
     """
-    found = known or _recognised(path)
+    found = known or recognised(path)
     # Some of the libraries take long to import, and each file needs one of them.
     if found == "hdf5":
         from ebarf_ns.events.readers.hdf5 import read_hdf5
@@ -52,7 +52,7 @@ def open_recording(
     return read_text(path, time_unit)
 
 
-def _recognised(path: Path) -> RecordingFormat:
+def recognised(path: Path) -> RecordingFormat:
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return "bag"

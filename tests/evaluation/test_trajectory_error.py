@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import EvaluationError
+from ebarf_ns.evaluation.compare import compare_files
 from ebarf_ns.evaluation.trajectory_error import (
     aligned_positions,
-    compare_files,
     reference_in_estimates_world,
     trajectory_error,
 )

@@ -153,3 +153,14 @@ def _mono(packet: Any, place: Callable[[int], str]) -> Piece:
     return Piece(events["x"], events["y_p"] & 0x7FFF, t_us, (events["y_p"] >> 15).astype(np.int8), place)
 
 
+def read_bag_frames(path: Path, size: tuple[int, int]) -> Iterator[tuple[int, np.ndarray]]:
+    """8-bit grey images as large as the event sensor, which only its own are, with their times in microseconds."""
+    with _opened(path) as bag:
+        connections = [one for one in bag.connections if one.msgtype == "sensor_msgs/msg/Image"]
+        if not connections:
+            return
+        for connection, _, raw in bag.messages(connections):
+            image: Any = bag.deserialize(raw, connection.msgtype)
+            if (image.width, image.height) == size and image.encoding in ("mono8", "8UC1"):
+                grey = np.asarray(image.data, np.uint8).reshape(image.height, image.step)[:, : image.width]
+                yield image.header.stamp.sec * 10**6 + (image.header.stamp.nanosec + 500) // 1000, grey

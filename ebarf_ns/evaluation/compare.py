@@ -1,18 +1,50 @@
-"""Which conventions a trajectory's file follows, found by trying them against a reference."""
+"""Trajectories in files against each other, and which conventions a file follows, found by trying them."""
 
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from ebarf_ns.errors import EvaluationError, TrajectoryError
-from ebarf_ns.evaluation.trajectory_error import rotation_errors_deg
+from ebarf_ns.evaluation.trajectory_error import ALIGNMENTS, errors_under_each_alignment, rotation_errors_deg
 from ebarf_ns.geometry.trajectory import Trajectory
-from ebarf_ns.geometry.trajectory_formats import Axes, Quaternion, TrajectoryFormat, Transform, read_trajectory
+from ebarf_ns.geometry.trajectory_formats import (
+    Axes,
+    Quaternion,
+    TrajectoryFormat,
+    Transform,
+    order_is_known,
+    read_trajectory,
+)
 
 # The right convention is better than all others by this factor, or the motion cannot tell.
 _CLEARLY = 0.5
 _STILL_DEG = 0.01
+
+
+def compare_files(
+    estimate: Path, reference: Path, known: TrajectoryFormat = TrajectoryFormat()
+) -> dict[str, Any]:
+    """The errors of a trajectory against another under every alignment that is defined for them.
+
+    The files are of any format that :func:`read_trajectory` knows; ``known`` is of the estimate. Raises
+    :class:`EvaluationError` where no alignment is defined.
+    """
+    true, notes = read_trajectory(reference)
+    if order_is_known(estimate, known):
+        estimated, said = read_trajectory(estimate, known)
+        said += _note_on_axes(estimate, true, known)
+    else:
+        estimated, said = read_by_reference(estimate, true, known)
+    errors, reasons = errors_under_each_alignment(estimated, true)
+    if not errors:
+        raise EvaluationError(f"{estimate}: {next(iter(reasons.values()))}")
+    comparison: dict[str, Any] = {alignment: None for alignment in ALIGNMENTS}
+    for alignment, error in errors.items():
+        comparison[alignment] = vars(error).copy()
+        comparison["matched"] = comparison[alignment].pop("matched")
+    notes = said + notes + [f"{alignment}: {reason}" for alignment, reason in reasons.items()]
+    return {**comparison, "scale": errors["sim3"].scale if "sim3" in errors else None, "notes": notes}
 
 
 def read_by_reference(
@@ -41,16 +73,17 @@ def read_by_reference(
         )
     trajectory, notes = read_trajectory(path, best)
     notes.append(f"{path.name}: {best.quaternion}, {best.transform} fits the reference to {best_deg:.2g} deg")
-    if known.axes is None:
-        notes += _note_on_axes(path, reference, best)
-    return trajectory, notes
+    return trajectory, notes + _note_on_axes(path, reference, best)
 
 
 def _note_on_axes(path: Path, reference: Trajectory, found: TrajectoryFormat) -> list[str]:
     """Only where the two bodies are one do axes show; then those given should fit best."""
-    tried = sorted(
-        (_off_deg(path, reference, replace(found, axes=axes), body=False), axes) for axes in get_args(Axes)
-    )
+    if found.axes:
+        return []
+    try:
+        tried = sorted((_off_deg(path, reference, replace(found, axes=one), body=False), one) for one in get_args(Axes))
+    except TrajectoryError:
+        return []
     (best_deg, axes), (second_deg, _) = tried[:2]
     assumed: Axes = "opencv"
     if best_deg > _CLEARLY * second_deg or axes == assumed:

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from ebarf_ns.errors import TrajectoryError
-from ebarf_ns.evaluation.conventions import read_by_reference
+from ebarf_ns.evaluation.compare import read_by_reference
 from ebarf_ns.geometry.trajectory_file import read_tum
 from tests.conftest import DATA
 

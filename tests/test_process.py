@@ -1,0 +1,295 @@
+"""Datasets' folders, made here with the keys, types and clocks that their authors use, become scenes."""
+
+import json
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ebarf_ns.calibration import read_calibration
+from ebarf_ns.errors import EbarfError, RecordingError, SceneError
+from ebarf_ns.events.intake import Intake
+from ebarf_ns.events.recording import read_recording
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
+from ebarf_ns.inspection import inspect_scene
+from ebarf_ns.process import ProcessSettings, process
+from ebarf_ns.scene import read_scene
+from tests.conftest import DATA, REPOSITORY, run_command, run_ok
+from tests.events import writers
+
+SECONDS = 2.0
+EVENTS: list[writers.Event] = [(t, t // 1000 % 64, t // 3000 % 48, t // 7000 % 2) for t in range(0, 2_000_000, 1000)]
+POSES = [(t, 0.1 * t / 1e6, np.sin(t / 1e6), 0.0) for t in range(0, 2_100_000, 8333)]
+TURNS = [Rotation.from_rotvec([0.1 * t / 1e6, 0.2, 0.05 * t / 1e6]) for t, *_ in POSES]
+
+
+def columns() -> dict[str, np.ndarray]:
+    t, x, y, p = (np.array(column) for column in zip(*EVENTS, strict=True))
+    return {"t": t.astype(np.int64), "x": x.astype(np.uint16), "y": y.astype(np.uint16), "p": p.astype(np.uint8)}
+
+
+def write_h5(path: Path, group: str, shift_us: int = 0) -> None:
+    with h5py.File(path, "w") as file:
+        for name, column in columns().items():
+            file[f"{group}/{name}"] = column + shift_us if name == "t" else column
+
+
+def poses(unit: str, shift_us: int = 0, turn: Rotation | None = None) -> str:
+    lines = []
+    for (t, *position), of_camera in zip(POSES, TURNS, strict=True):
+        t += shift_us  # noqa: PLW2901
+        time = {"s": f"{t // 10**6}.{t % 10**6:06d}", "us": f"{t}", "ns": f"{1000 * t}"}[unit]
+        quat = (of_camera * turn if turn else of_camera).as_quat()
+        lines.append(f"{time} {' '.join(f'{v:.9f}' for v in (*position, *quat))}\n")
+    return "".join(lines)
+
+
+def picture(path: Path, side: int = 16) -> None:
+    path.parent.mkdir(exist_ok=True, parents=True)
+    cv2.imwrite(str(path), np.arange(side * side, dtype=np.uint8).reshape(side, side))
+
+
+def basalt(turn: Rotation) -> dict:
+    """TUM-VIE's own layout, with its event cameras as small as the events here."""
+    qx, qy, qz, qw = turn.as_quat().tolist()
+    pose = {"px": 0.1, "py": 0.0, "pz": -0.05, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
+    still = {"px": 0.0, "py": 0.0, "pz": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
+    lens = {"fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "k1": -0.1, "k2": 0.07, "k3": -0.2, "k4": 0.18}
+    intrinsics = [{"camera_type": "kb4", "intrinsics": lens}] * 4
+    size = [[16, 16], [16, 16], [64, 48], [64, 48]]
+    return {"value0": {"intrinsics": intrinsics, "resolution": size, "T_imu_cam": [still, still, pose, pose]}}
+
+
+def tumvie(folder: Path) -> Path:
+    folder.mkdir()
+    write_h5(folder / "mocap-desk2-events_left.h5", "events")
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1])
+    (folder / "camera-calibrationA.json").write_text(json.dumps(basalt(turn)))
+    qx, qy, qz, qw = turn.as_quat().tolist()
+    marker = {"px": 0.1, "py": 0.0, "pz": -0.05, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
+    (folder / "mocap-imu-calibrationA.json").write_text(json.dumps({"value0": {"T_imu_marker": marker}}))
+    ground = folder / "vi_gt_data"
+    for k in range(10):
+        picture(ground / "left_images" / f"{k:05d}.jpg")
+    times = "# timestamps [us]\n" + "".join(f"{150_000 * k}\n" for k in range(10))
+    (ground / "image_timestamps_left.txt").write_text(times)
+    (ground / "mocap_data.txt").write_text("#timestamp [us] px py pz qx qy qz qw\n" + poses("us"))
+    return folder
+
+
+def eds(folder: Path) -> Path:
+    folder.mkdir()
+    start_us = 1_600_000_000_000_000
+    write_h5(folder / "events.h5", "/", start_us)
+    (folder / "stamped_groundtruth.txt").write_text("# t px py pz qx qy qz qw\n" + poses("s", start_us))
+    return folder
+
+
+def esim(folder: Path) -> Path:
+    (folder / "events").mkdir(parents=True)
+    column = columns()
+    rows = np.stack([column["x"], column["y"], column["t"] * 1000, 2 * column["p"].astype(int) - 1], axis=1)
+    for k, part in enumerate(np.array_split(rows, 4)):
+        np.save(folder / "events" / f"{k:010d}.npy", part.astype(float))
+    (folder / "room_poses_all.txt").write_text("# t_ns px py pz qx qy qz qw\n" + poses("ns"))
+    return folder
+
+
+def robust(folder: Path) -> Path:
+    folder.mkdir()
+    column = columns()
+    position = np.stack([column["x"], column["y"]], axis=1)
+    np.savez(folder / "raw_events.npz", position=position, timestamp=1000 * column["t"], polarity=column["p"] > 0)
+    np.savez(
+        folder / "camera_poses.npz",
+        T_wc_position=np.array([one[1:] for one in POSES], np.float32),
+        T_wc_orientation=np.array([turn.as_quat() for turn in TURNS], np.float32),
+        T_wc_timestamp=np.array([1000 * one[0] for one in POSES]),
+    )
+    np.savez(
+        folder / "camera_calibration.npz",
+        intrinsics=np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), distortion_params=np.array([]),
+        distortion_model="plumb_bob", img_height=48, img_width=64, pos_contrast_threshold=0.25,
+        neg_contrast_threshold=0.3, refractory_period=0, bayer_pattern="",
+    )  # fmt: skip
+    return folder
+
+
+def calibration(folder: Path) -> Path:
+    path = folder / "camera.json"
+    camera = {"model": "pinhole", "width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24, "distortion": []}
+    path.write_text(json.dumps({"camera": camera}))
+    return path
+
+
+MADE = {"tumvie": tumvie, "eds": eds, "esim": esim, "robust-e-nerf": robust}
+
+
+@pytest.mark.parametrize("layout", list(MADE))
+@pytest.mark.parametrize("named", [True, False])
+def test_a_dataset_becomes_a_scene(tmp_path: Path, layout: str, named: bool):
+    source = MADE[layout](tmp_path / "source")
+    before = {path: path.stat().st_mtime_ns for path in source.rglob("*")}
+    settings = ProcessSettings(camera=calibration(tmp_path) if layout in ("eds", "esim") else None)
+    said = process(layout if named else "auto", source, tmp_path / "scene", settings)  # pyright: ignore[reportArgumentType]
+    assert {path: path.stat().st_mtime_ns for path in source.rglob("*")} == before
+    scene = read_scene(tmp_path / "scene")
+    recording, expected = read_recording(scene.events, 64, 48), writers.recording(EVENTS)
+    assert np.array_equal(recording.t_us - recording.t_us[0], expected.t_us) and np.array_equal(recording.x, expected.x)
+    keyframes = read_tum(scene.trajectory)
+    assert np.allclose(keyframes.poses.position[:5].numpy(), [one[1:] for one in POSES[:5]], atol=1e-6)
+    turned = Rotation.from_quat(keyframes.poses.quat_wxyz[:5, [1, 2, 3, 0]].numpy())
+    assert (turned * Rotation.concatenate(TURNS[:5]).inv()).magnitude().max() < 1e-6
+    assert scene.groundtruth and any("2,000 events read, 2,000 kept" in sentence for sentence in said)
+    summary = inspect_scene(tmp_path / "scene")
+    assert summary.events == 2000 and summary.keyframes > 200
+    if layout == "tumvie":
+        assert len(scene.frames) == 10 and scene.frames[0].camera.width == 16 and scene.camera.model == "equidistant"
+    if layout == "robust-e-nerf":
+        assert scene.contrast_threshold and scene.contrast_threshold.off == 0.3
+
+
+def test_a_scene_of_a_recording_and_an_odometry(tmp_path: Path):
+    writers.raw(tmp_path / "a.raw", "3.0", writers.evt3(EVENTS), size=(64, 48))
+    (tmp_path / "odometry.txt").write_text(poses("s"))
+    out = run_command(
+        "ebarf", "process", "auto", tmp_path / "a.raw", "--output", tmp_path / "scene", "--camera",
+        calibration(tmp_path), "--trajectory", tmp_path / "odometry.txt", "--contrast-threshold", 0.2, 0.25,
+        "--farthest", 3.0, "--end-us", 1_000_000,
+    )  # fmt: skip
+    assert out.code == 0 and "left out: 999 events outside the time window" in out.errors, out.errors
+    scene = read_scene(tmp_path / "scene")
+    assert scene.bounds and np.array(scene.bounds)[1].max() > 2.5 and scene.groundtruth is None
+    assert scene.contrast_threshold and scene.contrast_threshold.on == 0.2
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
+    name = path.stem.split("_")[0]
+    if name == "evo":
+        pytest.skip("a bag; its reader has tests of its own")
+    source = MADE[name](tmp_path / "source")
+    words = ["ebarf", "process", "--config", path, "--source", source, "--output", tmp_path / "scene"]
+    if name == "eds":
+        # The real camera is larger than the events here need.
+        words += ["--start-us", 1_600_000_000_000_000]
+    else:
+        words += ["--start-us", 0]
+    run_ok(*words)
+    scene = read_scene(tmp_path / "scene")
+    assert scene.camera.width == (640 if name == "eds" else 64)
+    assert (scene.contrast_threshold is None) == (path.stem == "eds_00")
+
+
+def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
+    source = tumvie(tmp_path / "source")
+    lines = [line.split() for line in poses("us").splitlines()]
+    permuted = "".join(f"{float(t)} {x} {y} {z} {qy} {qz} {qw} {qx}\n" for t, x, y, z, qx, qy, qz, qw in lines)
+    (tmp_path / "devo.txt").write_text(permuted)
+    said = process("tumvie", source, tmp_path / "scene", ProcessSettings(trajectory=tmp_path / "devo.txt"))
+    assert any("yzwx" in sentence for sentence in said)
+    keyframes = read_tum(tmp_path / "scene" / "trajectory.txt")
+    back = Rotation.from_quat(keyframes.poses.quat_wxyz[0, [1, 2, 3, 0]].numpy())
+    assert (back * TURNS[0].inv()).magnitude() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (ProcessSettings(), "expected --camera"),
+        (ProcessSettings(camera=Path("gone.json")), "gone.json"),
+        (ProcessSettings(events=Intake(start_us=10**9)), "expected --camera"),
+    ],
+)
+def test_what_is_missing_is_said_and_leaves_no_folder(tmp_path: Path, settings: ProcessSettings, words: str):
+    with pytest.raises(EbarfError, match=words):
+        process("esim", esim(tmp_path / "source"), tmp_path / "scene", settings)
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+
+
+def test_two_sizes_of_one_sensor_are_an_error(tmp_path: Path):
+    writers.raw(tmp_path / "a.raw", "2.0", writers.evt2(EVENTS), size=(1280, 720))
+    with pytest.raises(SceneError, match="1280 x 720 pixels, the calibration 64 x 48"):
+        process("raw", tmp_path / "a.raw", tmp_path / "scene", ProcessSettings(camera=calibration(tmp_path)))
+
+
+def test_a_trajectory_on_another_clock_is_an_error(tmp_path: Path):
+    (tmp_path / "late.txt").write_text(poses("s", 10**12))
+    settings = ProcessSettings(camera=calibration(tmp_path), trajectory=tmp_path / "late.txt")
+    with pytest.raises(EbarfError, match="on the same clock"):
+        process("esim", esim(tmp_path / "source"), tmp_path / "scene", settings)
+
+
+def test_a_zip_is_as_good_as_its_folder(tmp_path: Path):
+    import shutil
+
+    esim(tmp_path / "source")
+    shutil.make_archive(str(tmp_path / "source"), "zip", tmp_path, "source")
+    said = process("esim", tmp_path / "source.zip", tmp_path / "scene", ProcessSettings(camera=calibration(tmp_path)))
+    assert any("2,000 kept" in sentence for sentence in said)
+
+
+CALIBRATIONS = {
+    "kalibr.yaml": (
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [60.0, 61.0, 32.0, 24.0]\n  distortion_model: equidistant\n"
+        "  distortion_coeffs: [0.1, 0.0, 0.0, 0.0]\n  resolution: [64, 48]\n",
+        "equidistant",
+    ),
+    "dsec.yaml": (
+        "intrinsics:\n  cam0:\n    camera_matrix: [60.0, 61.0, 32.0, 24.0]\n    resolution: [64, 48]\n"
+        "    distortion_model: radtan\n    distortion_coeffs: [-0.1, 0.1, 0.0, 0.0]\n",
+        "radtan",
+    ),
+    "ros.yaml": (
+        "image_width: 64\nimage_height: 48\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        "  data: [60.0, 0, 32.0, 0, 61.0, 24.0, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+        "distortion_coefficients:\n  data: [-0.1, 0.1, 0.0, 0.0, 0.0]\n",
+        "radtan",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(CALIBRATIONS))
+def test_calibrations_as_others_write_them(tmp_path: Path, name: str):
+    text, model = CALIBRATIONS[name]
+    (tmp_path / name).write_text(text)
+    camera = read_calibration(tmp_path / name).camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 60, 61, 32, 24)
+    assert camera.model == model
+
+
+@pytest.mark.parametrize("side", ["A", "B"])
+def test_real_calibrations_of_tum_vie(side: str):
+    path = DATA / "calibration" / "tumvie" / f"camera-calibration{side}.json"
+    if not path.is_file():
+        pytest.skip(f"no calibrations at {DATA}; set EBARF_TEST_DATA to their folder")
+    found = read_calibration(path, "2")
+    assert (found.camera.width, found.camera.height) == (1280, 720) and 1000 < found.camera.fx < 1100
+    assert found.rig_from_camera is not None and np.isclose(np.linalg.det(found.rig_from_camera), 1)
+
+
+def test_a_raw_recording_is_inspected(tmp_path: Path):
+    path = writers.raw(tmp_path / "a.raw", "2.0", writers.evt2(EVENTS), size=None)
+    summary = json.loads(run_ok("ebarf", "inspect", path, "--picture", tmp_path / "sheet.png", "--json"))
+    assert summary["events"] == 2000 and (summary["width"], summary["height"]) == (64, 48)
+    assert (summary["start_us"], summary["end_us"]) == (0, 1_999_000) and sum(summary["rate"]) == 2000
+    sheet = cv2.imread(str(tmp_path / "sheet.png"), cv2.IMREAD_GRAYSCALE)
+    assert sheet is not None and len(np.unique(sheet)) > 2
+
+
+def test_swapped_columns_of_a_real_file_are_caught(tmp_path: Path):
+    swapped = DATA / "readers" / "swapped_xy.hdf5"
+    if not swapped.is_file():
+        pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")
+    (tmp_path / "t.txt").write_text(poses("s"))
+    (tmp_path / "calib.txt").write_text("200 200 172 129 0 0 0 0 0")
+    settings = ProcessSettings(
+        trajectory=tmp_path / "t.txt", camera=tmp_path / "calib.txt", sensor_size=(346, 128),
+        trajectory_format=TrajectoryFormat("s"),
+    )  # fmt: skip
+    with pytest.raises(RecordingError, match="the sensor height"):
+        process("hdf5", swapped, tmp_path / "scene", settings)
