@@ -33,9 +33,7 @@ class Calibrated:
     """4x4, of the IMU or whatever else the file refers to."""
 
 
-def read_calibration(
-    path: Path, which: str | None = None, sensor_size: tuple[int, int] | None = None
-) -> Calibrated:
+def read_calibration(path: Path, which: str | None = None, sensor_size: tuple[int, int] | None = None) -> Calibrated:
     """The camera named or numbered ``which``, the only one where not given; raises :class:`SceneError`.
 
     TUM-VIE's (basalt's) JSON, kalibr's camchain and DSEC's YAML, ROS' camera_info, Robust e-NeRF's npz, a scene.json,

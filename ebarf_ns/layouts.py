@@ -83,7 +83,9 @@ def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) ->
         imu_from_marker = pose_matrix(json.loads(marker.read_text(encoding="utf-8"))["value0"]["T_imu_marker"])
         groundtruth = _moved(marker_path, np.linalg.inv(imu_from_marker) @ _rig(event_camera, cameras))
     elif mocap:
-        notes.append(f"{mocap.name} is left out: it has poses of a marker, and {marker.name}, which relates it, is missing")
+        notes.append(
+            f"{mocap.name} is left out: it has poses of a marker, and {marker.name}, which relates it, is missing"
+        )
     event_from_grey = np.linalg.inv(_rig(event_camera, cameras)) @ _rig(grey_camera, cameras)
     frames = []
     for stamps in folder.glob(f"**/image_timestamps_{side}.txt"):
@@ -93,7 +95,9 @@ def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) ->
             FrameFile(path, t_us, grey_camera.camera, event_from_grey, "srgb")
             for path, t_us in zip(images, times, strict=True)
         ]
-    return Ingredients(lambda: read_hdf5(events, "events"), event_camera.camera, groundtruth, tuple(frames), notes=notes)
+    return Ingredients(
+        lambda: read_hdf5(events, "events"), event_camera.camera, groundtruth, tuple(frames), notes=notes
+    )
 
 
 def eds(folder: Path) -> Ingredients:
@@ -139,7 +143,7 @@ def recognised_layout(folder: Path) -> Layout:
         "ecd": "events.txt", "tumvie": "*events_*.h5", "eds": "events.h5", "robust-e-nerf": "raw_events.npz",
         "esim": "events/*.npy",
     }  # fmt: skip
-    found = [layout for layout, mark in marks.items() if any(folder.glob(mark))]
+    found: list[Layout] = [layout for layout, mark in marks.items() if any(folder.glob(mark))]
     if len(found) != 1:
         raise SceneError(
             f"{folder}: looks like {' and '.join(found) or 'none'} of the datasets known; expected one of "
@@ -172,7 +176,9 @@ def _only(folder: Path, pattern: str) -> Path:
 def _at_most_one(folder: Path, pattern: str) -> Path | None:
     found = sorted(folder.glob(pattern))
     if len(found) > 1:
-        raise SceneError(f"{folder}: holds {len(found)} files {pattern}, expected one: {', '.join(p.name for p in found)}")
+        raise SceneError(
+            f"{folder}: holds {len(found)} files {pattern}, expected one: {', '.join(p.name for p in found)}"
+        )
     return found[0] if found else None
 
 

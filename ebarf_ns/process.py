@@ -72,7 +72,7 @@ def process(
     format: Format,
     source: Path,
     output: Path,
-    settings: ProcessSettings = ProcessSettings(),
+    settings: ProcessSettings,
     progress: Callable[[int], None] = lambda events: None,
 ) -> list[str]:
     """Make a scene folder, and say what was read, recognised, repaired and left out.
@@ -176,10 +176,7 @@ def _assemble(
         bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
     )
     write_scene(scene)
-    notes.append(
-        f"{len(initial.t_us)} keyframes around the events, "
-        f"{len(frames)} of {seen} frames within their span"
-    )
+    notes.append(f"{len(initial.t_us)} keyframes around the events, {len(frames)} of {seen} frames within their span")
     return report.sentences() + notes
 
 
@@ -197,9 +194,7 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
     return camera
 
 
-def _initial(
-    path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None
-) -> tuple[Trajectory, list[str]]:
+def _initial(path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None) -> tuple[Trajectory, list[str]]:
     """As the file says; the order of quaternions that it does not say, the reference tells where there is one."""
     if groundtruth is None or order_is_known(path, known):
         return read_trajectory(path, known)
@@ -222,7 +217,11 @@ def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Tr
 def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Corners of a box around the cameras and all that they see up to a distance."""
     corners = torch.tensor(
-        [[x, y] for x in (0, (camera.width - 1) / 2, camera.width - 1) for y in (0, (camera.height - 1) / 2, camera.height - 1)]
+        [
+            [x, y]
+            for x in (0, (camera.width - 1) / 2, camera.width - 1)
+            for y in (0, (camera.height - 1) / 2, camera.height - 1)
+        ]
     )
     bearings = camera.bearings(corners)
     position, quat_wxyz = trajectory.poses

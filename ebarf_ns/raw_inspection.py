@@ -90,8 +90,8 @@ def _count(path: Path, counts: np.ndarray, piece: Piece) -> np.ndarray:
     width, height = max(int(x.max()) + 1, counts.shape[1]), max(int(y.max()) + 1, counts.shape[0])
     if min(int(x.min()), int(y.min())) < 0 or max(width, height) > _LARGEST_SENSOR:
         raise RecordingError(
-            f"{path}: x from {x.min()} to {x.max()} and y from {y.min()} to {y.max()} around {piece.place(0)}, expected "
-            f"0 to {_LARGEST_SENSOR - 1} at most"
+            f"{path}: x from {x.min()} to {x.max()} and y from {y.min()} to {y.max()} around {piece.place(0)}, "
+            f"expected 0 to {_LARGEST_SENSOR - 1} at most"
         )
     if (height, width) != counts.shape:
         counts = np.pad(counts, ((0, height - counts.shape[0]), (0, width - counts.shape[1])))
@@ -147,7 +147,7 @@ def print_raw_summary(summary: RawSummary, path: Path) -> None:
     table = Table(title=str(path), show_header=False, title_justify="left")
     seconds = (summary.end_us - summary.start_us) * 1e-6
     size = f"{summary.width} x {summary.height}"
-    most = max(max(summary.rate), 1)
+    most = max(1, *summary.rate)
     for name, value in (
         ("format", summary.format),
         ("sensor", size if summary.sensor_size_said else f"{size} at least, by its events; the file does not say"),
@@ -164,4 +164,3 @@ def print_raw_summary(summary: RawSummary, path: Path) -> None:
         console.print(f"[yellow]![/yellow] {suspicion}")
     if not summary.suspicions:
         console.print("[green]nothing suspicious[/green]")
-

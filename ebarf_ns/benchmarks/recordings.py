@@ -1,4 +1,4 @@
-"""How fast recordings become scenes, beside what other libraries take to read the same files, and in how much memory."""
+"""How fast recordings become scenes, beside what other libraries take to read them, and in how much memory."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def _figures(settings: RecordingsBenchmark, folder: Path) -> Iterator[Figure]:
         count = settings.events if name == "hdf5" else settings.events // 10
         path = _WRITERS[name](folder, count)
         # Twice, for the kernels are compiled the first time.
-        ours = min(_seconds(lambda path=path: _taken(path, folder / "out.h5")) for _ in range(2))
+        ours = min(_seconds(_taken, path, folder / "out.h5") for _ in range(2))
         yield Figure(f"{name}, {count:,} events into a scene", count / ours / 1e6, "M events/s", at_least=target)
         for library, read in _PLAIN.get(name, {}).items():
-            yield Figure(f"{name}, the same by {library}", count / _seconds(lambda: read(path)) / 1e6, "M events/s")
+            yield Figure(f"{name}, the same by {library}", count / _seconds(read, path) / 1e6, "M events/s")
         path.unlink()
     if settings.huge:
         path = write_hdf5(folder, settings.huge)
@@ -59,9 +59,9 @@ def _figures(settings: RecordingsBenchmark, folder: Path) -> Iterator[Figure]:
         yield Figure(name, settings.huge / result["seconds"] / 1e6, "M events/s", at_least=20.0)
 
 
-def _seconds(call: Callable[[], object]) -> float:
+def _seconds(call: Callable[..., object], *arguments: object) -> float:
     started = perf_counter()
-    call()
+    call(*arguments)
     return perf_counter() - started
 
 

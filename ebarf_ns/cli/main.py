@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 import yaml
@@ -95,7 +95,9 @@ class Inspect:
 
     def run(self) -> None:
         """Print the summary."""
-        if not (self.scene / "scene.json").exists() and (self.scene.is_file() or (self.scene / "metadata.yaml").exists()):
+        if not (self.scene / "scene.json").exists() and (
+            self.scene.is_file() or (self.scene / "metadata.yaml").exists()
+        ):
             summary = self._recording()
         else:
             summary = self._scene()
@@ -224,8 +226,8 @@ class Bench:
     recordings: tyro.conf.OmitArgPrefixes[RecordingsBenchmark] = field(default_factory=RecordingsBenchmark)
     """How much to read."""
     output: Path | None = None
-    """Of engine and recordings: a JSON file for the figures. Of a comparison: the folder for scenes, runs, records and diagrams;
-    where not given, bench/ and the manifest's name."""
+    """Of engine and recordings: a JSON file for the figures. Of a comparison: the folder for scenes, runs, records and
+    diagrams; where not given, bench/ and the manifest's name."""
     json: bool = False
     """Print one JSON object and nothing else."""
 

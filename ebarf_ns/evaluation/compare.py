@@ -6,9 +6,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 from ebarf_ns.errors import EvaluationError, TrajectoryError
-from ebarf_ns.evaluation.trajectory_error import ALIGNMENTS, errors_under_each_alignment, rotation_errors_deg
+from ebarf_ns.evaluation.trajectory_error import (
+    ALIGNMENTS,
+    errors_under_each_alignment,
+    rotation_errors_by_positions_deg,
+)
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_formats import (
+    NOTHING_KNOWN,
     Axes,
     Quaternion,
     TrajectoryFormat,
@@ -22,9 +27,7 @@ _CLEARLY = 0.5
 _STILL_DEG = 0.01
 
 
-def compare_files(
-    estimate: Path, reference: Path, known: TrajectoryFormat = TrajectoryFormat()
-) -> dict[str, Any]:
+def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> dict[str, Any]:
     """The errors of a trajectory against another under every alignment that is defined for them.
 
     The files are of any format that :func:`read_trajectory` knows; ``known`` is of the estimate. Raises
@@ -48,7 +51,7 @@ def compare_files(
 
 
 def read_by_reference(
-    path: Path, reference: Trajectory, known: TrajectoryFormat = TrajectoryFormat()
+    path: Path, reference: Trajectory, known: TrajectoryFormat = NOTHING_KNOWN
 ) -> tuple[Trajectory, list[str]]:
     """A trajectory read by the conventions under which its rotations are those of the reference.
 
@@ -94,7 +97,7 @@ def _note_on_axes(path: Path, reference: Trajectory, found: TrajectoryFormat) ->
 def _off_deg(path: Path, reference: Trajectory, attempt: TrajectoryFormat, body: bool) -> float:
     estimate, _ = read_trajectory(path, attempt)
     try:
-        world_deg, body_deg = rotation_errors_deg(estimate, reference)
+        same_body_deg, other_body_deg = rotation_errors_by_positions_deg(estimate, reference)
     except EvaluationError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
-    return body_deg if body else world_deg
+        raise TrajectoryError(f"{path}: {error}; expected --quaternion and --transform, which cannot be told") from None
+    return other_body_deg if body else same_body_deg

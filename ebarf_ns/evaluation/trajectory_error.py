@@ -110,14 +110,30 @@ def _rotations(path: PosePath3D) -> Rotation:
     return Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3])
 
 
-def rotation_errors_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
-    """The rotation errors of :class:`TrajectoryError`, without and with one for the body, which need no motion.
+def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
+    """The rotation error of :class:`TrajectoryError`, which needs no motion.
 
     Raises :class:`EvaluationError` for fewer than 3 poses within the reference's span.
     """
     estimated, true = _matched(estimate, reference)
-    turned, straight = _rotations(estimated), _rotations(true)
-    return _rotation_error_deg(turned, straight, with_body=False), _rotation_error_deg(turned, straight, with_body=True)
+    return _rotation_error_deg(_rotations(estimated), _rotations(true), with_body=False)
+
+
+def rotation_errors_by_positions_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
+    """Rotation errors in the world to which the positions are aligned, without and with one rotation for the body.
+
+    Of a quaternion's columns in another order, some are the right rotations up to another world and another body: only
+    the positions tell them apart. Raises :class:`EvaluationError` where they are on a line.
+    """
+    estimated, true = _matched(estimate, reference)
+    turned = _rotations(estimated)
+    world, _, _ = _umeyama(estimated, true, correct_scale=True)
+    difference = (Rotation.from_matrix(world) * turned).inv() * _rotations(true)
+    return _spread_deg(difference), _spread_deg(difference.mean().inv() * difference)
+
+
+def _spread_deg(rotations: Rotation) -> float:
+    return float(np.degrees(np.sqrt(np.mean(rotations.magnitude() ** 2))))
 
 
 def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> float:
@@ -127,8 +143,7 @@ def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> 
     for _ in range(_ALTERNATIONS if with_body else 0):
         body = ((world * estimate).inv() * true).mean()
         world = (true * (estimate * body).inv()).mean()
-    errors = (world * estimate * body).inv() * true
-    return float(np.degrees(np.sqrt(np.mean(errors.magnitude() ** 2))))
+    return _spread_deg((world * estimate * body).inv() * true)
 
 
 def _body(estimate: Rotation, true: Rotation) -> Rotation:
@@ -181,7 +196,7 @@ def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str,
     """
     errors, _ = errors_under_each_alignment(estimate, reference)
     try:
-        rotation_deg, _ = rotation_errors_deg(estimate, reference)
+        rotation_deg = rotation_error_deg(estimate, reference)
     except EvaluationError:
         rotation_deg = None
     results: dict[str, Any] = {"alignment": "sim3", "rotation_deg": rotation_deg}

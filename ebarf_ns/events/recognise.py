@@ -53,6 +53,7 @@ def open_recording(
 
 
 def recognised(path: Path) -> RecordingFormat:
+    """What a file or folder is; raises :class:`RecordingError` where it is none of those."""
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return "bag"

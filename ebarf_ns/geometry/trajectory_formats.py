@@ -52,6 +52,9 @@ class TrajectoryFormat:
     """A time for each pose, for files without (KITTI, LLFF, COLMAP): a line each, "time" or "name time"."""
 
 
+NOTHING_KNOWN = TrajectoryFormat()
+
+
 @dataclass(frozen=True)
 class _Raw:
     """A file's content before conventions are applied."""
@@ -68,7 +71,7 @@ class _Raw:
     time_unit: TimeUnit | None = None
 
 
-def read_trajectory(path: Path, known: TrajectoryFormat = TrajectoryFormat()) -> tuple[Trajectory, list[str]]:
+def read_trajectory(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> tuple[Trajectory, list[str]]:
     """Poses in order of time, and what was recognised; raises :class:`TrajectoryError`.
 
     TUM text in any unit, TUM-VIE's ``mocap_data.txt``, EDS' ground truth, KITTI, COLMAP's ``images.txt`` and
@@ -79,8 +82,8 @@ def read_trajectory(path: Path, known: TrajectoryFormat = TrajectoryFormat()) ->
     quaternion = known.quaternion or raw.quaternion
     if raw.rotation.ndim == 2 and quaternion is None:
         raise TrajectoryError(
-            f"{path}: times in {unit} with a point and no line of names are how DEVO and DEIO write quaternions as qy qz "
-            "qw qx; expected --quaternion yzwx for that, or xyzw"
+            f"{path}: times in {unit} with a point and no line of names are how DEVO and DEIO write quaternions as "
+            "qy qz qw qx; expected --quaternion yzwx for that, or xyzw"
         )
     transform, axes = known.transform or raw.transform, known.axes or raw.axes
     t_us = torch.tensor([_in_us(path, time, unit) for time in raw.times], dtype=torch.int64)
@@ -115,7 +118,9 @@ def _recognised_unit(path: Path, times: list[Decimal]) -> TimeUnit:
     """The unit in which poses come a tenth of a millisecond to ten seconds apart."""
     spacing = float(np.median(np.abs(np.diff(np.array(times, dtype=float))))) if len(times) > 1 else 0.0
     units: tuple[TimeUnit, ...] = ("s", "us", "ns")
-    fitting = [unit for unit in units if _SPACINGS_S[0] <= spacing * float(_US[unit]) * 1e-6 <= _SPACINGS_S[1]]
+    fitting: list[TimeUnit] = [
+        unit for unit in units if _SPACINGS_S[0] <= spacing * float(_US[unit]) * 1e-6 <= _SPACINGS_S[1]
+    ]
     if fitting == ["us", "ns"]:
         # A tenth of a second or more in microseconds, or as little as a tenth of a millisecond in nanoseconds: since
         # 1970, nanoseconds have grown by 18 digits, and microseconds by 15.
@@ -316,5 +321,7 @@ def _times(path: Path, count: int, names: list[str] | None, known: TrajectoryFor
     if names is not None and all(Path(name).name in times for name in names):
         return [times[Path(name).name] for name in names]
     if len(times) != count:
-        raise TrajectoryError(f"{known.pose_times}: {len(times)} times, expected one for each of the {count} poses of {path}")
+        raise TrajectoryError(
+            f"{known.pose_times}: {len(times)} times, expected one for each of the {count} poses of {path}"
+        )
     return list(times.values())

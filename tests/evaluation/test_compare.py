@@ -20,7 +20,11 @@ def test_a_reference_tells_the_order_of_real_quaternions(name: str):
 
 
 def test_where_the_motion_cannot_tell_it_says_so(tmp_path: Path):
-    still = "".join(f"{k}.0 {k} 0 0 0.5 0.5 0.5 0.5\n" for k in range(10))
+    line = "".join(f"{k}.0 {k} 0 0 0.5 0.5 0.5 0.5\n" for k in range(10))
+    (tmp_path / "t.txt").write_text(line)
+    with pytest.raises(TrajectoryError, match="which cannot be told"):
+        read_by_reference(tmp_path / "t.txt", read_tum(tmp_path / "t.txt"))
+    still = "".join(f"{k}.0 {k} {k * k} 0 0.5 0.5 0.5 0.5\n" for k in range(10))
     (tmp_path / "t.txt").write_text(still)
     with pytest.raises(TrajectoryError, match="which this motion cannot tell"):
         read_by_reference(tmp_path / "t.txt", read_tum(tmp_path / "t.txt"))

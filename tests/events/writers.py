@@ -1,6 +1,5 @@
 """Recordings in other people's formats, written as the formats' descriptions have them: for tests alone."""
 
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -90,10 +89,3 @@ def dat(path: Path, events: Sequence[Event]) -> Path:
     words = [(t & 0xFFFFFFFF, x | y << 14 | p << 28) for t, x, y, p in events]
     path.write_bytes(header + bytes([0x0C, 8]) + np.array(words, "<u4").tobytes())
     return path
-
-
-def ros1_event_array(events: Sequence[Event], width: int, height: int) -> bytes:
-    message = struct.pack("<III", 0, 0, 0) + struct.pack("<I", 3) + b"cam" + struct.pack("<III", height, width, len(events))
-    for t, x, y, p in events:
-        message += struct.pack("<HHIIB", x, y, t // 10**6, t % 10**6 * 1000, p)
-    return message

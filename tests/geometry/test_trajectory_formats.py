@@ -132,9 +132,7 @@ def test_llff(tmp_path: Path):
 
 
 def test_robust_e_nerf(tmp_path: Path):
-    np.savez(
-        tmp_path / "camera_poses.npz", T_wc_position=POSITION, T_wc_orientation=QUAT, T_wc_timestamp=T_US * 1000
-    )
+    np.savez(tmp_path / "camera_poses.npz", T_wc_position=POSITION, T_wc_orientation=QUAT, T_wc_timestamp=T_US * 1000)
     check(read_trajectory(tmp_path / "camera_poses.npz")[0])
 
 

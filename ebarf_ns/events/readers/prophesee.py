@@ -67,7 +67,12 @@ class Decoder:
         if self.swapped_halves:
             words = (words << np.uint64(32)) | (words >> np.uint64(32))
         most = len(words) * _EVENTS_A_WORD[self.encoding]
-        columns = np.empty(most, np.uint16), np.empty(most, np.uint16), np.empty(most, np.int64), np.empty(most, np.int8)
+        columns = (
+            np.empty(most, np.uint16),
+            np.empty(most, np.uint16),
+            np.empty(most, np.int64),
+            np.empty(most, np.int8),
+        )
         count, bad = _DECODERS[self.encoding](words, self._state, *columns)
         if bad >= 0:
             raise ValueError(f"word {self.words + bad:,} is {int(words[bad]):#x}, no word of {self.encoding.upper()}")
@@ -189,7 +194,7 @@ def _decode_evt21(words, state, x, y, t_us, polarity):
 
 @njit(cache=True)
 def _decode_evt3(words, state, x, y, t_us, polarity):
-    """16-bit words, each of which changes one thing: the row, the time's halves, or where a run of neighbours begins."""
+    """16-bit words, each of which changes one thing: the row, half of the time, or where a run of neighbours begins."""
     count = 0
     for i in range(len(words)):
         word = np.int64(words[i])

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
@@ -44,7 +43,7 @@ class _Layout(NamedTuple):
 
 
 def read_text(path: Path, time_unit: TimeUnit | None = None) -> Source:
-    """Times are seconds where they have a point, and else microseconds, unless the names or ``time_unit`` say otherwise.
+    """Times are seconds where they have a point, else microseconds, unless their name or ``time_unit`` says otherwise.
 
     Raises :class:`RecordingError` with file, line, text and expectation; nothing is repaired or dropped.
     """
@@ -113,7 +112,8 @@ def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
         table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], block.count(b"\n") + 1)
         if bad_line:
             text = block.split(b"\n")[bad_line - line].decode(errors="replace").strip()
-            names = " ".join(name for role in layout.roles for name in ("t x y p".split()[role] if role >= 0 else "-",))
+            columns = {_TIME: f"t[{layout.unit}]", _X: "x", _Y: "y", _POLARITY: "p", _UNUSED: "-"}
+            names = " ".join(columns[role] for role in layout.roles)
             raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'")
         if len(table):
             t_us, x, y, polarity, lines = table.T
@@ -136,7 +136,7 @@ def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
 
 
 @njit(cache=True)
-def _parse(content, first_line, roles, time_decimals, most) -> Int64[np.ndarray, "events 5"]:
+def _parse(content, first_line, roles, time_decimals, most):
     """Rows (t_us, x, y, p, line), and the number of the first malformed line or 0."""
     table = np.empty((most, _TABLE), np.int64)
     count = 0
@@ -204,9 +204,9 @@ def _number(content, i, decimals, rounded):
             i += 1
         ok = ok and any_digit
         power += sign * exponent
-    if i < len(content) and not (content[i] in (32, 9, 10, 13, 44, 59, 35)):
+    if i < len(content) and content[i] not in (32, 9, 10, 13, 44, 59, 35):
         ok = False
-        while i < len(content) and not (content[i] in (32, 9, 10, 13, 44, 59, 35)):
+        while i < len(content) and content[i] not in (32, 9, 10, 13, 44, 59, 35):
             i += 1
     if value and power > 0:
         ok = ok and digits + power <= _SIGNIFICANT
