@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from ebarf_ns.events.recording import read_recording
 from ebarf_ns.scene import read_scene
-from tests.conftest import REPOSITORY, run_ok
+from tests.conftest import REPOSITORY, TINY_TRAINING, run_ok
+from tests.events import writers
 
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", README, re.S)]
@@ -49,6 +51,27 @@ def test_the_real_recording_block_runs(slider_depth: Path, tmp_path: Path):
     (metrics,) = (tmp_path / "outputs").rglob("metrics.jsonl")
     last = json.loads(metrics.read_text().splitlines()[-1])
     assert last["heldout_event_loss"] < 1 and last["ate_m_orientation"] < 0.05
+
+
+def test_the_block_of_an_own_recording_runs(tiny_scene: Path, tmp_path: Path):
+    (block,) = [block for block in BLOCKS if any("recording.raw" in line for line in block)]
+    scene = read_scene(tiny_scene)
+    events = read_recording(scene.events, scene.camera.width, scene.camera.height)
+    columns = (events.t_us, events.x, events.y, events.polarity > 0)
+    rows = list(zip(*(column.astype(int).tolist() for column in columns), strict=True))
+    writers.raw(tmp_path / "recording.raw", "3.0", writers.evt3(rows), size=(scene.camera.width, scene.camera.height))
+    camera = scene.camera
+    (tmp_path / "calibration.yaml").write_text(
+        f"cam0:\n  intrinsics: [{camera.fx}, {camera.fy}, {camera.cx}, {camera.cy}]\n"
+        f"  distortion_coeffs: []\n  resolution: [{camera.width}, {camera.height}]\n"
+    )
+    shutil.copy(scene.trajectory, tmp_path / "odometry.txt")
+    for line in block:
+        words = shlex.split(line)
+        quick = [*TINY_TRAINING, "--max-num-iterations=20", "--vis=tensorboard"] if words[0] == "ns-train" else []
+        run_ok(*words, *quick, cwd=tmp_path)
+    made = read_recording(tmp_path / "my_scene" / "events.h5", camera.width, camera.height)
+    assert (made.t_us == events.t_us).all() and (made.polarity == events.polarity).all()
 
 
 def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
