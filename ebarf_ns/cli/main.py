@@ -65,9 +65,8 @@ class Process:
         source = self.folder or self.source
         if source is None:
             raise SceneError("no recording named, expected: ebarf process FORMAT SOURCE --output SCENE")
-        with Progress(
-            TextColumn("{task.description}"), SpinnerColumn(), TimeElapsedColumn(), transient=True, console=_stderr
-        ) as progress:
+        columns = TextColumn("{task.description}"), SpinnerColumn(), TimeElapsedColumn()
+        with Progress(*columns, transient=True, console=_stderr, disable=not _stderr.is_terminal) as progress:
             task = progress.add_task("reading", total=None)
             said = process(
                 self.format,
