@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.intake import Intake, take_in
+from ebarf_ns.events.intake import Intake, checked, take_in
 from ebarf_ns.events.recognise import open_recording
 from ebarf_ns.events.recording import Recording, read_recording
 from tests.conftest import DATA
@@ -157,12 +157,10 @@ def test_a_cut_file_is_an_error_or_the_events_before_the_cut(tmp_path: Path, nam
     for place in places:
         cut.write_bytes(content[:place])
         try:
-            source = open_recording(cut)
-            take_in(source, SIZE, Intake(), tmp_path / "out.h5")
+            back = checked(open_recording(cut), SIZE)
         except RecordingError as error:
             assert str(cut) in str(error) and "\n" not in str(error)
             continue
-        back = read_recording(tmp_path / "out.h5", *SIZE)
         assert np.array_equal(back.t_us, expected.t_us[: len(back)]) and np.array_equal(back.x, expected.x[: len(back)])
         # Nothing is missing that the file still holds; formats without lengths cannot know of what was cut off.
         assert len(back) == len(expected) or name.split(".")[-1] in ("raw", "dat", "txt"), place
@@ -178,7 +176,7 @@ def test_flipped_bytes_of_the_header_never_end_in_a_traceback(tmp_path: Path, na
             flipped.write_bytes(content)
             content[place] ^= bits
             try:
-                take_in(open_recording(flipped), SIZE, Intake(), tmp_path / "out.h5")
+                checked(open_recording(flipped), SIZE)
             except RecordingError as error:
                 assert "flipped" in str(error)
 
