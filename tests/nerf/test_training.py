@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from nerfstudio.utils import writer
 
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf import method
@@ -34,6 +35,8 @@ def config(scene: Path, output: Path, name: str = "ebarf", steps: int = 12) -> E
 
 def trainer(made: EbarfTrainerConfig) -> EbarfTrainer:
     torch.manual_seed(made.machine.seed)
+    # Nerfstudio would go on writing for every run that this process ever began.
+    writer.EVENT_WRITERS.clear()
     ready = made.setup(local_rank=0, world_size=1)
     ready.setup()
     return ready
