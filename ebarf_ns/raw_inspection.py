@@ -10,12 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.intake import far_busier
 from ebarf_ns.events.source import Piece, Source
 from ebarf_ns.files import whole_file
 
 _LARGEST_SENSOR = 8192
 _SLOT_US = 100_000
-_HOTTEST = 5
+_HOTTEST, _HOT_DEVIATIONS = 5, 50
 _PICTURES, _PICTURE_US = 12, 20_000
 _BARS = " ▁▂▃▄▅▆▇█"
 
@@ -113,12 +114,11 @@ def _suspicions(source: Source, counts: np.ndarray, brighter: float, late: int) 
         found.append(f"{late:,} events are earlier than the one before them; ebarf process has --unsorted sort")
     if not 0.35 < brighter < 0.65:
         found.append(f"{brighter:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?")
-    active = counts[counts > 0]
-    middle = float(np.median(active))
-    deviation = max(float(np.median(np.abs(active - middle))), 0.1 * middle)
-    hot = int(np.count_nonzero(active > middle + 50 * deviation))
+    hot = int(np.count_nonzero(far_busier(counts, _HOT_DEVIATIONS)))
     if hot:
-        found.append(f"{hot} pixels are more than 50 deviations busier than usual; ebarf process has --hot-pixels")
+        found.append(
+            f"{hot} pixels are more than {_HOT_DEVIATIONS} deviations busier than usual; ebarf process has --hot-pixels"
+        )
     return found
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
-from ebarf_ns.errors import EbarfError, one_line_errors
+from ebarf_ns.errors import EbarfError, SceneError, one_line_errors
 from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
 from ebarf_ns.process import Format, ProcessSettings
 from ebarf_ns.simulation.simulate import Simulation
@@ -58,7 +58,6 @@ class Process:
 
     def run(self) -> None:
         """Make the scene and say what is in it."""
-        from ebarf_ns.errors import SceneError
         from ebarf_ns.process import process
 
         _refuse_existing(self.output)
@@ -283,8 +282,6 @@ def _print_json(content: dict[str, Any]) -> None:
 
 
 def _refuse_existing(output: Path) -> None:
-    from ebarf_ns.errors import SceneError
-
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise SceneError(f"{output}: exists, expected a new folder; remove it first where it is not needed")
 
@@ -293,8 +290,6 @@ def _with_config(words: list[str]) -> list[str]:
     """The words of a command, those of the file that ``--config`` names before the others, which may overrule them."""
     if words[:1] != ["process"] or "--config" not in words[:-1]:
         return words
-    from ebarf_ns.errors import SceneError
-
     path = Path(words[words.index("--config") + 1])
     source = words[words.index("--source") + 1] if "--source" in words[:-1] else ""
     places = {"{source}": source, "{config}": str(path.parent)}

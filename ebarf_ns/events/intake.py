@@ -65,7 +65,6 @@ class IntakeReport:
     last_us: int = 0
     left_out: Counter[str] = field(default_factory=Counter)
     repaired: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)
 
     def sentences(self) -> list[str]:
         """For people."""
@@ -73,7 +72,7 @@ class IntakeReport:
         found = [f"{self.format}: {self.read:,} events read, {self.kept:,} kept, over {span_s:.3f} s"]
         found += [f"left out: {count:,} {reason}" for reason, count in self.left_out.items() if count]
         found += [f"repaired: {count:,} {what}" for what, count in self.repaired.items() if count]
-        return found + self.notes
+        return found
 
 
 def take_in(
@@ -116,6 +115,11 @@ def hot_pixels(
     counts = np.zeros(width * height, np.int64)
     for piece in _checked(source, sensor_size, intake, IntakeReport(), lambda events: None):
         counts += np.bincount(piece.pixels(width), minlength=len(counts))
+    return far_busier(counts, deviations)
+
+
+def far_busier(counts: Int64[np.ndarray, "*pixels"], deviations: float) -> Bool[np.ndarray, "*pixels"]:
+    """Which pixels have far more events than usual, see :func:`hot_pixels`."""
     active = counts[counts > 0]
     if not len(active):
         return counts > 0
@@ -268,10 +272,11 @@ def _filtered(
     width, height = sensor_size
     last_us = np.full(width * height, -_MAX_TIME_US)
     last_polarity = np.zeros(width * height, np.int8)
+    of_hot = f"events of {np.count_nonzero(hot)} hot pixels" if hot is not None else ""
     for piece in pieces:
         if hot is not None:
             cold = ~hot[piece.pixels(width)]
-            report.left_out[f"events of {np.count_nonzero(hot)} hot pixels"] += int(len(cold) - np.count_nonzero(cold))
+            report.left_out[of_hot] += int(len(cold) - np.count_nonzero(cold))
             piece = piece.select(cold)  # noqa: PLW2901
         if intake.duplicates == "drop" or intake.refractory_us:
             columns = piece.pixels(width), piece.t_us, piece.polarity

@@ -17,7 +17,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.readers.prophesee import Decoder
+from ebarf_ns.events.readers.prophesee import TIMELESS, Decoder
 from ebarf_ns.events.source import Piece, Source
 
 _ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -85,7 +85,7 @@ def _pieces(path: Path, topic: str, dropped: Counter[str]) -> Iterator[Piece]:
                 if packet.encoding == "evt3":
                     decoder = decoder or Decoder("evt3")
                     piece = _evt3(path, number, decoder, packet)
-                    dropped["events before the first time word, whose time is unknown"] = decoder.timeless
+                    dropped[TIMELESS] = decoder.timeless
                 elif packet.encoding == "mono":
                     piece = _mono(packet, place)
                 else:

@@ -24,7 +24,8 @@ _WORD: dict[Encoding, str] = {"evt2": "<u4", "evt2.1": "<u8", "evt3": "<u2"}
 _EVENTS_A_WORD: dict[Encoding, int] = {"evt2": 1, "evt2.1": 32, "evt3": 12}
 _BYTES_AT_ONCE = 1 << 20
 _LONGEST_HEADER = 1 << 16
-_TIMELESS = "events before the first time word, whose time is unknown"
+TIMELESS = "events before the first time word, whose time is unknown"
+"""Why some events of a stream are left out."""
 # What a decoder remembers from word to word.
 _TIME_HIGH, _TIME_LOW, _EPOCH, _Y, _X_BASE, _POLARITY, _TIMELESS_EVENTS, _STATE = range(8)
 _UNKNOWN = -1
@@ -103,7 +104,7 @@ def _raw_pieces(path: Path, begin: int, decoder: Decoder, dropped: Counter[str])
                 raise RecordingError(
                     f"{path}: {error} (words begin at byte {begin:,}); expected the encoding of its header"
                 ) from None
-            dropped[_TIMELESS] = decoder.timeless
+            dropped[TIMELESS] = decoder.timeless
             if len(columns[0]):
                 yield Piece(*columns, numbered(events))
                 events += len(columns[0])
