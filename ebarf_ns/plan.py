@@ -16,7 +16,7 @@ import torch
 
 from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_log, quat_wxyz_multiply, rotate
-from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
+from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate
 from ebarf_ns.radiance.field import fastest_precision
 from ebarf_ns.radiance.ray_sampling import Rays, leave_box
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _GROWTH = 1.6
 _STRAIGHT_PX = 0.25
+_AS_GOOD_AS_STRAIGHT_PX = 0.02
+_UNEVEN = 4.0
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def plan_for(
             "this processor multiplies bfloat16 natively" if precision == "bfloat16" else "no native bfloat16 here",
         ),
         Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
+        Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(scene, trajectory)),
         Line(
             "pipeline.datamanager.train_num_rays_per_batch", rays, f"keeps {'a GPU' if rays > 1024 else 'caches'} full"
         ),
@@ -179,6 +182,21 @@ def _stride(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
     if stride == 1:
         return 1, f"{rate:.0f} keyframes a second: further apart, motion or the noise left by smoothing is not straight"
     return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
+
+
+def _interpolation(scene: Scene, trajectory: Trajectory) -> tuple[Interpolation, str]:
+    """A spline where the motion between keyframes is no straight line, if they are spaced evenly enough for one."""
+    keyframes = len(trajectory.t_us)
+    gaps_us = trajectory.t_us.diff().double()
+    uneven = float(gaps_us.max() / gaps_us.min())
+    if keyframes < 5 or uneven > _UNEVEN:
+        return "linear", f"{keyframes} keyframes, gaps between them up to {uneven:.3g} times the shortest: no spline"
+    distance = _distance(scene, trajectory)[0] if scene.bounds is not None else None
+    # Halving the distance between knots leaves a quarter of what is not straight.
+    off_px = _off_straight_px(smoothed(trajectory), 2, scene.camera.fx, distance) / 4
+    if off_px < _AS_GOOD_AS_STRAIGHT_PX:
+        return "linear", f"between keyframes the motion is straight to {off_px:.2g} px"
+    return "cubic", f"between keyframes the motion is off a straight line by {off_px:.2g} px"
 
 
 def _off_straight_px(smooth: Trajectory, stride: int, focal_px: float, distance: float | None) -> float:

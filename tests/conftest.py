@@ -9,8 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from ebarf_ns.cli.main import entrypoint
+
+# How long an example takes says more of what else the machine does than of the code.
+settings.register_profile("ebarf", deadline=None)
+settings.load_profile("ebarf")
 
 REPOSITORY = Path(__file__).parent.parent
 DATA = Path(os.environ.get("EBARF_TEST_DATA", REPOSITORY.parent / "shared" / "data"))

@@ -12,7 +12,15 @@ import torch
 from torch import Tensor
 
 from ebarf_ns.errors import TrajectoryError
-from ebarf_ns.geometry.so3 import quat_wxyz_exp, quat_wxyz_multiply, quat_wxyz_to_matrix, rotate, slerp_wxyz
+from ebarf_ns.geometry.so3 import (
+    quat_wxyz_conjugate,
+    quat_wxyz_exp,
+    quat_wxyz_log,
+    quat_wxyz_multiply,
+    quat_wxyz_to_matrix,
+    rotate,
+    slerp_wxyz,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int64
@@ -84,37 +92,47 @@ def interpolate(
     keyframe_t_us: Int64[Tensor, "keyframes"],
     keyframes: Poses,
     t_us: Int64[Tensor, "*batch"],
-    translation: Interpolation = "linear",
+    kind: Interpolation = "linear",
 ) -> Poses:
-    """The poses at ``t_us``: SLERP of the rotations, and LERP (Eq. 3) or a natural cubic spline of the positions.
+    """The poses at ``t_us``: SLERP of the rotations and LERP of the positions (Eq. 3), or both with velocities that
+    run on through the keyframes, as natural cubic splines have them.
 
     Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
     """
     left, exact_fraction = intervals(keyframe_t_us, t_us)
-    dtype = keyframes.position.dtype
-    fraction = exact_fraction.to(dtype)
-    a, b = keyframes.position[left], keyframes.position[left + 1]
-    position = a + fraction[..., None] * (b - a)
-    if translation == "cubic":
-        curvature = _natural_spline_curvature(keyframe_t_us, keyframes.position)
-        interval_us = keyframe_t_us[left + 1] - keyframe_t_us[left]
-        interval_s = (interval_us.double() * 1e-6).to(dtype)[..., None]
-        u = fraction[..., None]
-        position = position + interval_s**2 / 6 * (
-            ((1 - u) ** 3 - (1 - u)) * curvature[left] + (u**3 - u) * curvature[left + 1]
-        )
-    return Poses(position, slerp_wxyz(keyframes.quat_wxyz[left], keyframes.quat_wxyz[left + 1], fraction))
+    fraction = exact_fraction.to(keyframes.position)
+    a, b = (Poses(keyframes.position[k], keyframes.quat_wxyz[k]) for k in (left, left + 1))
+    line = Poses(
+        a.position + fraction[..., None] * (b.position - a.position), slerp_wxyz(a.quat_wxyz, b.quat_wxyz, fraction)
+    )
+    if kind == "linear":
+        return line
+    turn, shift = _bulge(keyframe_t_us, keyframes, left, fraction).split(3, dim=-1)
+    return Poses(line.position + shift, quat_wxyz_multiply(line.quat_wxyz, quat_wxyz_exp(turn)))
 
 
-def _natural_spline_curvature(
-    keyframe_t_us: Int64[Tensor, "keyframes"], position: Float[Tensor, "keyframes 3"]
-) -> Float[Tensor, "keyframes 3"]:
-    """Second derivatives of the natural cubic spline at its knots, per second squared (zero at both ends)."""
-    interval_s = (keyframe_t_us[1:] - keyframe_t_us[:-1]).double() * 1e-6
-    slope = (position[1:] - position[:-1]).double() / interval_s[:, None]
-    bend = torch.nn.functional.pad(6 * (slope[1:] - slope[:-1]), (0, 0, 1, 1))
-    curvature: Tensor = _SolveTridiagonal.apply(interval_s, bend)  # pyright: ignore[reportAssignmentType]
-    return curvature.to(position.dtype)
+def _bulge(
+    keyframe_t_us: Int64[Tensor, "keyframes"],
+    keyframes: Poses,
+    left: Int64[Tensor, "*batch"],
+    fraction: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch 6"]:
+    """What natural cubic splines add to straight lines between keyframes: a small rotation in the camera's frame, and
+    a shift.
+
+    The rotations' spline is that of the body's angular velocity. It takes the frames of neighbouring keyframes for
+    the same, which matters as little as the second derivative turns from one to the next.
+    """
+    position, quat_wxyz = keyframes
+    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))
+    change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)
+    interval_s = keyframe_t_us.diff().double() * 1e-6
+    slope = change.double() / interval_s[:, None]
+    bend = torch.nn.functional.pad(6 * slope.diff(dim=0), (0, 0, 1, 1))
+    curvature: Tensor = _SolveTridiagonal.apply(interval_s, bend).to(position)  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+    u = fraction[..., None]
+    before, after = ((1 - u) ** 3 - (1 - u)) * curvature[left], (u**3 - u) * curvature[left + 1]
+    return interval_s.to(position)[left][..., None] ** 2 / 6 * (before + after)
 
 
 class _SolveTridiagonal(torch.autograd.Function):

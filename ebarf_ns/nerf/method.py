@@ -52,7 +52,7 @@ def _trainer(
 def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConfig:
     """The seed paper's method; its baseline is the same with the poses frozen."""
     model = EbarfModelConfig(
-        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False, keyframe_stride=1),
+        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False, keyframe_stride=1, interpolation="linear"),
         loss="normalized",
         brightness="lin_log",
         intensity_range="unit",

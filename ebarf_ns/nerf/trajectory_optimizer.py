@@ -27,8 +27,9 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
-    interpolation: Interpolation = "linear"
-    """Of positions between keyframes: linear (Eq. 3), or the natural cubic spline of the reference implementation."""
+    interpolation: Interpolation | None = None
+    """Between keyframes: straight and at constant velocity (Eq. 3), or with velocities that run on through the
+    keyframes; None: as planned."""
 
 
 class TrajectoryOptimizer(CameraOptimizer):
@@ -96,7 +97,7 @@ class TrajectoryOptimizer(CameraOptimizer):
 
     def poses_at(self, t_us: Int[Tensor, "*batch"]) -> Poses:
         """Corrected poses at given times."""
-        return interpolate(self.keyframe_t_us, self.keyframes(), t_us, self.config.interpolation)
+        return interpolate(self.keyframe_t_us, self.keyframes(), t_us, self.config.interpolation or "linear")
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Turn event rays, given in the camera's frame at their time, into world rays; others already are."""

@@ -33,7 +33,7 @@ def wander(count: int = 20, seed: int = 0) -> tuple[np.ndarray, Rotation]:
     return random.standard_normal((count, 3)), Rotation.random(count, rng=np.random.default_rng(seed))
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 100), st.floats(0.1, 10))
 def test_a_similarity_is_no_error(seed: int, scale: float):
     position, turn = wander(seed=seed)

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
@@ -37,7 +37,6 @@ def taken(folder: Path, events: Sequence[writers.Event], **intake: object) -> tu
 EVENT = st.tuples(st.integers(-5000, 5000), st.integers(0, 23), st.integers(0, 17), st.integers(0, 1))
 
 
-@settings(deadline=None)
 @given(st.lists(EVENT, min_size=1).map(sorted), st.integers(1, 9))
 def test_events_in_order_arrive_as_they_are(tmp_path_factory: pytest.TempPathFactory, events: list, piece: int):
     path = tmp_path_factory.mktemp("intake") / "events.h5"
@@ -53,7 +52,6 @@ def test_events_in_order_arrive_as_they_are(tmp_path_factory: pytest.TempPathFac
             assert (times[first:] >= millisecond * 1000).all() and (times[:first] < millisecond * 1000).all()
 
 
-@settings(deadline=None)
 @given(st.lists(EVENT, min_size=1), st.integers(1, 9))
 def test_sorting_is_stable_and_loses_nothing(tmp_path_factory: pytest.TempPathFactory, events: list, piece: int):
     with pytest.MonkeyPatch.context() as patch:

@@ -42,7 +42,7 @@ def by_pixel(events: Recording) -> dict[int, list[int]]:
     return found
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 1000), st.integers(30, 200), st.integers(1, 5))
 def test_every_pair_is_what_the_stream_says(seed: int, count: int, steps: int):
     events = recording(seed, count)
@@ -108,7 +108,7 @@ def test_training_pairs_across_a_heldout_block_count_the_events_in_it():
     assert len(pairs) and (pairs.polarity_sum == 4).all() and (pairs.event_count == 4).all()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 1000), st.integers(1, 300), st.integers(16, 2000))
 def test_index_is_the_same_whatever_the_pieces_and_wherever_it_lies(seed: int, chunk: int, memory_bytes: int):
     events = recording(seed, 300)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
@@ -24,7 +24,6 @@ def columns(decoder: Decoder, content: bytes, size: int) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("encoding", list(ENCODERS))
-@settings(deadline=None)
 @given(events=EVENTS, size=st.integers(1, 40))
 def test_what_is_written_is_read_in_pieces_of_any_size(encoding, events: list[writers.Event], size: int):
     content = ENCODERS[encoding](events)
@@ -87,7 +86,6 @@ def test_an_unknown_encoding_is_named(tmp_path: Path, header: str):
         read_raw(path)
 
 
-@settings(deadline=None)
 @given(events=EVENTS)
 def test_dat_reads_back(tmp_path_factory: pytest.TempPathFactory, events: list[writers.Event]):
     source = read_dat(writers.dat(tmp_path_factory.mktemp("dat") / "a.dat", events))

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
@@ -27,7 +27,6 @@ def test_times_are_exact(tmp_path: Path):
     assert recording.x.tolist() == [96, 1, 239] and recording.polarity.tolist() == [-1, 1, 1]
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**13), st.integers(0, 239), st.integers(0, 179), st.integers(0, 1)), min_size=1

@@ -28,8 +28,39 @@ def test_agrees_with_scipy(seed: int, count: int, kind: str):
     else:
         expected = np.stack([np.interp(t, t_us.numpy(), axis) for axis in poses.position.numpy().T], axis=1)
     assert np.allclose(found.position.numpy(), expected, atol=1e-9)
+    if kind == "cubic":
+        return
     turned = Slerp(t_us.numpy(), Rotation.from_quat(poses.quat_wxyz.numpy()[:, [1, 2, 3, 0]]))(t)
     assert np.allclose(quat_wxyz_to_matrix(found.quat_wxyz).numpy(), turned.as_matrix(), atol=1e-7)
+
+
+def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, float]:
+    """Largest error [m, rad] of a motion that turns and goes to and fro, away from its ends."""
+
+    def motion(t_us: np.ndarray) -> tuple[np.ndarray, Rotation]:
+        t = t_us[:, None] * 1e-6
+        swing = np.sin(t * np.array([5.0, 7.0, 6.0]) + np.array([0.3, 1.0, 2.0]))
+        return swing, Rotation.from_rotvec(0.4 * swing) * Rotation.from_rotvec(t * np.array([0.0, 2.0, 0.0]))
+
+    t_us = np.arange(0, 2_000_001, 1_000_000 // keyframes_per_s)
+    position, rotation = motion(t_us)
+    poses = Poses(torch.from_numpy(position), torch.from_numpy(rotation.as_quat()[:, [3, 0, 1, 2]]))
+    between = np.random.default_rng(0).integers(500_000, 1_500_000, 500)
+    found = interpolate(torch.from_numpy(t_us), poses, torch.from_numpy(between), kind)  # pyright: ignore[reportArgumentType]
+    true_position, true_rotation = motion(between)
+    turned = Rotation.from_quat(found.quat_wxyz.numpy()[:, [1, 2, 3, 0]])
+    off_rad = (true_rotation.inv() * turned).magnitude()
+    return float(np.abs(found.position.numpy() - true_position).max()), float(off_rad.max())
+
+
+def test_a_spline_follows_a_smooth_motion_that_lines_cut_short():
+    lines, splines, finer = (
+        np.array(errors_between_keyframes(*what)) for what in (("linear", 20), ("cubic", 20), ("cubic", 40))
+    )
+    assert (splines < 0.1 * lines).all()
+    # The error of a cubic goes with the fourth power of the spacing; that of rotations, whose frames turn, at least
+    # with the third.
+    assert splines[0] / finer[0] > 12 and splines[1] / finer[1] > 6
 
 
 @pytest.mark.parametrize("kind", ["linear", "cubic"])
