@@ -13,14 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import h5py
 import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.recording import Recording, joined
+from ebarf_ns.events.recording import Recording, joined, write_recording
 from ebarf_ns.events.source import Piece, Source
-from ebarf_ns.files import whole_file
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64
@@ -30,8 +28,6 @@ _MAX_TIME_US = 1 << 61
 _WRAPS_US, _NEAR_US = (1 << 31, 1 << 32), 1_000_000
 _RUN = np.dtype([("t_us", "<i8"), ("x", "<u2"), ("y", "<u2"), ("polarity", "i1")])
 _MERGED_AT_ONCE, _SAMPLE_EVERY = 1 << 20, 1 << 10
-_LONGEST_SPAN_US = 1 << 39
-_CHUNK = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,7 @@ def take_in(
     if intake.unsorted == "sort":
         pieces = _sorted(pieces, report)
     kept = _filtered(pieces, sensor_size, intake, hot, report)
-    _write(output, source.path, kept, report)
+    write_recording(output, _noted(kept, report), source.path)
     report.left_out += source.dropped
     return report
 
@@ -303,40 +299,9 @@ def _superfluous(pixel, t_us, polarity, last_us, last_polarity, drop_equal, refr
     return why
 
 
-def _write(output: Path, source: Path, pieces: Iterable[Recording], report: IntakeReport) -> None:
-    with whole_file(output) as temporary, h5py.File(temporary, "w") as file:
-        columns, offset_us, begun_ms = {}, 0, 0
-        for piece in pieces:
-            if not columns:
-                report.first_us = int(piece.t_us[0])
-                offset_us = report.first_us // 1000 * 1000
-                columns = {
-                    name: file.create_dataset(f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(_CHUNK,))
-                    for name, dtype in (("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1"))
-                }
-                # Long silences make long runs of one number.
-                columns["ms_to_idx"] = file.create_dataset(
-                    "ms_to_idx", (0,), "<u8", maxshape=(None,), chunks=(_CHUNK,), compression="gzip", compression_opts=1
-                )
-            t_us = piece.t_us - offset_us
-            if t_us[-1] >= _LONGEST_SPAN_US:
-                raise RecordingError(f"{source}: the events span {t_us[-1]} us, expected less than {_LONGEST_SPAN_US}")
-            # The milliseconds that begin after the last event before this piece, up to its own last one.
-            until_ms = int(t_us[-1]) // 1000 + 1
-            for first_ms in range(begun_ms, until_ms, _CHUNK):
-                milliseconds = np.arange(first_ms, min(first_ms + _CHUNK, until_ms))
-                _append(columns["ms_to_idx"], report.kept + np.searchsorted(t_us, 1000 * milliseconds))
-            begun_ms = until_ms
-            for name, values in (("x", piece.x), ("y", piece.y), ("t", t_us), ("p", piece.polarity > 0)):
-                _append(columns[name], values)
-            report.kept += len(piece)
-            report.last_us = int(piece.t_us[-1])
-        if not report.kept:
-            raise RecordingError(f"{source}: no event is left of {report.read:,}, expected some")
-        _append(columns["ms_to_idx"], np.array([report.kept]))
-        file["t_offset"] = np.int64(offset_us)
-
-
-def _append(column: h5py.Dataset, values: np.ndarray) -> None:
-    column.resize((len(column) + len(values),))
-    column[len(column) - len(values) :] = values
+def _noted(pieces: Iterable[Recording], report: IntakeReport) -> Iterator[Recording]:
+    for piece in pieces:
+        report.first_us = report.first_us if report.kept else int(piece.t_us[0])
+        report.last_us = int(piece.t_us[-1])
+        report.kept += len(piece)
+        yield piece

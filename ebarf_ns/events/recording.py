@@ -24,6 +24,7 @@ with suppress(ImportError):
 # Also the longest recording that gets a ms_to_idx table: about 6 days.
 _MAX_SPAN_US = 1 << 39
 _MAX_TIME_US = 1 << 61
+_CHUNK = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -170,16 +171,53 @@ def joined(pieces: Iterable[Recording]) -> Recording:
     return Recording(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
-def write_recording(path: Path, recording: Recording) -> None:
-    """Write the layout that :func:`read_recording` reads, with ``/ms_to_idx`` and the first millisecond as offset."""
-    t_offset_us = int(recording.t_us[0]) // 1000 * 1000
-    t_us = recording.t_us - t_offset_us
-    if t_us[-1] >= _MAX_SPAN_US:
-        raise RecordingError(f"{path}: the recording spans {t_us[-1]} us, expected less than {_MAX_SPAN_US}")
+def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None = None) -> int:
+    """Write the layout that :class:`RecordingFile` reads, with ``/ms_to_idx`` and the first millisecond as offset.
+
+    Takes the events piece by piece, in order of time, and returns their number. Raises :class:`RecordingError`, which
+    names ``source`` where it is given, for no events and for a span beyond 6 days.
+    """
+    count = offset_us = begun_ms = 0
+    columns: dict[str, h5py.Dataset] = {}
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-        group = file.create_group("events")
-        group["x"], group["y"], group["t"] = recording.x, recording.y, t_us
-        group["p"] = (recording.polarity > 0).astype(np.uint8)
-        milliseconds = np.arange(int(t_us[-1]) // 1000 + 2)
-        file["ms_to_idx"] = np.searchsorted(t_us, milliseconds * 1000).astype(np.uint64)
-        file["t_offset"] = np.int64(t_offset_us)
+        for piece in pieces:
+            if not len(piece):
+                continue
+            if not columns:
+                offset_us = int(piece.t_us[0]) // 1000 * 1000
+                columns = _columns(file)
+            t_us = piece.t_us - offset_us
+            if t_us[-1] >= _MAX_SPAN_US:
+                raise RecordingError(
+                    f"{source or path}: the events span {t_us[-1]} us, expected less than {_MAX_SPAN_US}"
+                )
+            # The milliseconds that begin after the last event before this piece, up to its own last one.
+            until_ms = int(t_us[-1]) // 1000 + 1
+            for first_ms in range(begun_ms, until_ms, _CHUNK):
+                milliseconds = np.arange(first_ms, min(first_ms + _CHUNK, until_ms))
+                _append(columns["ms_to_idx"], count + np.searchsorted(t_us, 1000 * milliseconds))
+            begun_ms = until_ms
+            for name, values in (("x", piece.x), ("y", piece.y), ("t", t_us), ("p", piece.polarity > 0)):
+                _append(columns[name], values)
+            count += len(piece)
+        if not count:
+            raise RecordingError(f"{source or path}: no event is left, expected some")
+        _append(columns["ms_to_idx"], np.array([count]))
+        file["t_offset"] = np.int64(offset_us)
+    return count
+
+
+def _columns(file: h5py.File) -> dict[str, h5py.Dataset]:
+    growing = {"shape": (0,), "maxshape": (None,), "chunks": (_CHUNK,)}
+    columns = {
+        name: file.create_dataset(f"events/{name}", dtype=dtype, **growing)
+        for name, dtype in (("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1"))
+    }
+    # Long silences make long runs of one number.
+    index = file.create_dataset("ms_to_idx", dtype="<u8", compression="gzip", compression_opts=1, **growing)
+    return {**columns, "ms_to_idx": index}
+
+
+def _append(column: h5py.Dataset, values: np.ndarray) -> None:
+    column.resize((len(column) + len(values),))
+    column[len(column) - len(values) :] = values

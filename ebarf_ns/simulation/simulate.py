@@ -81,7 +81,7 @@ def simulate(
         )
     keyframes = sample_trajectory(view.motion, _times_us(end_us, settings.keyframe_rate_hz))
     with whole_folder(folder) as temporary:
-        write_recording(temporary / "events.h5", recording)
+        write_recording(temporary / "events.h5", [recording])
         write_tum(temporary / "groundtruth.txt", sample_trajectory(view.motion, _times_us(end_us, 200.0)))
         write_tum(temporary / "trajectory.txt", perturb(keyframes, settings.errors, settings.seed))
         scene = Scene(

@@ -39,7 +39,7 @@ def test_written_recording_reads_back_equal(tmp_path_factory: pytest.TempPathFac
     t_us = np.sort(t).astype(np.int64) + start_us
     recording = Recording(x.astype(np.uint16), y.astype(np.uint16), t_us, np.where(p, 1, -1).astype(np.int8))
     path = tmp_path_factory.mktemp("h5") / "e.h5"
-    write_recording(path, recording)
+    write_recording(path, [recording])
     back = read_recording(path, WIDTH, HEIGHT)
     for column in ("x", "y", "t_us", "polarity"):
         assert np.array_equal(getattr(back, column), getattr(recording, column))

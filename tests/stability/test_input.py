@@ -31,7 +31,7 @@ def same(a: Recording, b: Recording) -> bool:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("whole") / "events.h5"
-    write_recording(path, some_events())
+    write_recording(path, [some_events()])
     return path
 
 
@@ -137,5 +137,5 @@ def test_case_24_nothing_derived_from_a_recording_is_kept_beside_it(whole: Path,
     assert same(read_recording(path, WIDTH, HEIGHT), some_events())
     assert [one.name for one in tmp_path.iterdir()] == ["events.h5"]
     assert hashlib.sha256(path.read_bytes()).digest() == before
-    write_recording(path, some_events(50))
+    write_recording(path, [some_events(50)])
     assert same(read_recording(path, WIDTH, HEIGHT), some_events(50))

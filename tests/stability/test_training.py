@@ -220,7 +220,7 @@ def variant(
 ) -> Path:
     """A copy of a scene with other events, other trajectories (both alike) and other entries in scene.json."""
     shutil.copytree(source, folder)
-    write_recording(folder / "events.h5", events(read_recording(folder / "events.h5", SMALL.width, SMALL.height)))
+    write_recording(folder / "events.h5", [events(read_recording(folder / "events.h5", SMALL.width, SMALL.height))])
     for name in ("trajectory.txt", "groundtruth.txt"):
         write_tum(folder / name, trajectory(read_tum(folder / name)))
     content = json.loads((folder / "scene.json").read_text())
