@@ -65,7 +65,7 @@ class EbarfModelConfig(ModelConfig):
     """Points per ray at which the field is asked; None: as planned."""
     coarse_samples: int = 128
     """Points per ray at which the remembered density is looked up for importance sampling."""
-    uniform_share: float = 0.1
+    uniform_share: float = 0.25
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
     density_cells: int | None = None
     """Cells per side of the remembered density; None: as planned."""

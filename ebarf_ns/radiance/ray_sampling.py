@@ -12,6 +12,10 @@ from ebarf_ns.radiance.field import RadianceField, contract
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+# A cell of the memory is coarser than a silhouette: a ray past an object's edge must find what is behind it, and so an
+# interval that is remembered as dense hides no more than 30 % of what comes after it.
+MOST_OPTICAL_DEPTH = 0.36
+
 
 class Rays(NamedTuple):
     """World rays with unit directions."""
@@ -119,7 +123,8 @@ def importance_edges(
     edges = coarse_edges(near, far, coarse, grid.half_side == 1)
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
     point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
-    weights = weights_of(grid.lookup(point), edges)
+    remembered = torch.minimum(grid.lookup(point), MOST_OPTICAL_DEPTH / edges.diff(dim=-1).clamp_min(1e-9))
+    weights = weights_of(remembered, edges)
     if pairs:
         weights = weights.unflatten(0, (2, -1)).mean(0).repeat(2, 1)
     # What passes through the scene is spread evenly too.

@@ -9,6 +9,7 @@ import torch
 from numba import njit, prange
 
 from ebarf_ns.radiance.hash_grid_numba import _FAST
+from ebarf_ns.radiance.ray_sampling import MOST_OPTICAL_DEPTH
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,7 +83,8 @@ def _place(origin, direction, far, jitter, density, near, half_side, cells, unif
                 x = origin[ray, 0] + middle * direction[ray, 0]
                 y = origin[ray, 1] + middle * direction[ray, 1]
                 z = origin[ray, 2] + middle * direction[ray, 2]
-                passed = np.exp(-density[_cell(x, y, z, half_side, cells)] * (upper - lower))
+                remembered = density[_cell(x, y, z, half_side, cells)]
+                passed = np.exp(-min(remembered * (upper - lower), np.float32(MOST_OPTICAL_DEPTH)))
                 weights[i + 1] += transmitted * (1 - passed) / sharing
                 transmitted *= passed
                 lower = upper

@@ -42,7 +42,7 @@ class Sampling:
     """Where the remembered density is, or everywhere evenly."""
     coarse_samples: int = 128
     """Points per ray at which the remembered density is looked up."""
-    uniform_share: float = 0.1
+    uniform_share: float = 0.25
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
     density_cells: int = 96
     """Cells per side of the remembered density."""

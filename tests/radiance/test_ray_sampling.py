@@ -144,6 +144,19 @@ def test_samples_placed_in_one_pass_are_those_of_the_reference(bounded: bool, pa
     assert (ours.diff(dim=-1) >= 0).all() and (not pairs or torch.equal(ours[:20], ours[20:]))
 
 
+@pytest.mark.parametrize("place", [importance_edges, ray_sampling_numba.importance_edges])
+def test_the_wall_behind_a_cell_that_a_ray_may_only_graze_is_looked_at_too(place):
+    grid = DensityGrid(16, bounded=True)
+    near_object, wall = (torch.tensor([[x, 0.01, 0.01]]) for x in (0.3, 0.97))
+    grid.density.zero_()
+    cells = ((torch.cat([near_object, wall]) + 1) * 8).long() @ torch.tensor([1, 16, 256])
+    grid.density[cells] = 1e4
+    rays = Rays(torch.full((1, 3), 0.01), torch.tensor([[1.0, 0, 0]]))
+    edges = place(grid, rays, 0.05, leave_box(rays), 16, 0.1, 16, torch.zeros(1, 1), False)
+    middle = (edges[0, 1:] + edges[0, :-1]) / 2
+    assert ((middle > 0.2) & (middle < 0.4)).sum() >= 4 and (middle > 0.86).sum() >= 2
+
+
 def test_no_rays_are_no_samples():
     rays, grid = Rays(torch.zeros(0, 3), torch.zeros(0, 3)), DensityGrid(16, bounded=True)
     for place in (importance_edges, ray_sampling_numba.importance_edges):
