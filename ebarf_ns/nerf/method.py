@@ -4,12 +4,13 @@ from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from ebarf_ns.nerf.datamanager import EventDataManagerConfig
 from ebarf_ns.nerf.model import EbarfModelConfig
 from ebarf_ns.nerf.pipeline import EbarfPipelineConfig
-from ebarf_ns.nerf.trainer import BudgetDecayConfig, EbarfTrainerConfig, FusedAdamConfig
+from ebarf_ns.nerf.trainer import BudgetDecayConfig, EbarfTrainerConfig, FusedAdamConfig, KeyframeAdamConfig
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizerConfig
 
 
@@ -18,7 +19,7 @@ def _trainer(
     datamanager: EventDataManagerConfig,
     model: EbarfModelConfig,
     field_rate: float,
-    pose_rate_px: float,
+    poses: OptimizerConfig,
     restart_field_at: float | None = None,
 ) -> EbarfTrainerConfig:
     return EbarfTrainerConfig(
@@ -39,7 +40,7 @@ def _trainer(
                 "scheduler": BudgetDecayConfig(),
             },
             "camera_opt": {
-                "optimizer": FusedAdamConfig(lr=pose_rate_px, betas=(0.9, 0.99)),
+                "optimizer": poses,
                 "scheduler": BudgetDecayConfig(),
             },
         },
@@ -67,7 +68,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         precision="float32",
     )
     datamanager = EventDataManagerConfig(longest_pair=1, train_num_rays_per_batch=1024)
-    return _trainer(method_name, datamanager, model, field_rate=5e-3, pose_rate_px=0.1)
+    return _trainer(method_name, datamanager, model, field_rate=5e-3, poses=FusedAdamConfig(lr=0.1))
 
 
 ebarf = MethodSpecification(
@@ -76,7 +77,7 @@ ebarf = MethodSpecification(
         EventDataManagerConfig(),
         EbarfModelConfig(),
         field_rate=1e-2,
-        pose_rate_px=0.1,
+        poses=KeyframeAdamConfig(lr=0.03),
         restart_field_at=0.07,
     ),
     description="NeRF from an event camera and its imperfect trajectory, which is refined on the way.",

@@ -27,6 +27,7 @@ from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
+from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
@@ -52,6 +53,15 @@ class FusedAdamConfig(OptimizerConfig):
     _target: type = torch.optim.Adam
     betas: tuple[float, float] = (0.9, 0.99)
     fused: bool = True
+
+
+@dataclass
+class KeyframeAdamConfig(OptimizerConfig):
+    """Adam with a second moment over the six numbers of a keyframe's correction."""
+
+    _target: type = KeyframeAdam
+    betas: tuple[float, float] = (0.9, 0.99)
+    eps: float = 1e-3
 
 
 @dataclass

@@ -1,0 +1,61 @@
+"""Adam that knows that the six numbers of a keyframe belong together."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_ROOTS_A_STEP = 256
+
+
+class KeyframeAdam(torch.optim.Optimizer):
+    """Adam whose second moment is a matrix for each row of its parameters.
+
+    A small rotation looks much like a shift: events tell their sum well, and their difference badly. Adam scales each
+    number by itself, so that the noise of the sum sets the pace of the difference too. Here the mean gradient of a row
+    is multiplied by C^(-1/2), C the running mean of its gradients' outer products (full-matrix AdaGrad, Duchi et al.
+    2011, with Adam's forgetting): each direction goes by its own noise. For rows of one number this is Adam.
+
+    ``eps`` is the share of a row's mean second moment that is added to each direction's. Inverse roots are computed
+    anew for no more than 256 rows a step, in turn; a row stays where it is until its first.
+    """
+
+    def __init__(self, params: Any, lr: float = 0.03, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-3):
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Move every row by about the learning rate in each direction whose gradient keeps its sign."""
+        assert closure is None
+        for group in self.param_groups:
+            for rows in group["params"]:
+                if rows.grad is not None:
+                    rows.sub_(group["lr"] * self._direction(rows, rows.grad, group["betas"], group["eps"]))
+
+    def _direction(
+        self, rows: Tensor, gradient: Float[Tensor, "rows dim"], betas: tuple[float, float], eps: float
+    ) -> Float[Tensor, "rows dim"]:
+        state, (beta1, beta2) = self.state[rows], betas
+        count, dim = gradient.shape
+        if not state:
+            state["step"] = 0
+            state["mean"] = torch.zeros_like(gradient)
+            state["outer"], state["root"] = (gradient.new_zeros(count, dim, dim) for _ in range(2))
+        step, outer, root = state["step"], state["outer"], state["root"]
+        state["mean"].lerp_(gradient, 1 - beta1)
+        outer.lerp_(gradient[:, :, None] * gradient[:, None, :], 1 - beta2)
+        due = (step * _ROOTS_A_STEP + torch.arange(min(count, _ROOTS_A_STEP), device=rows.device)) % count
+        root[due] = _inverse_root(outer[due] / (1 - beta2 ** (step + 1)), eps)
+        state["step"] = step + 1
+        return (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
+
+
+def _inverse_root(outer: Float[Tensor, "rows dim dim"], eps: float) -> Float[Tensor, "rows dim dim"]:
+    """(C + eps times its mean diagonal)^(-1/2); 0 where C is 0."""
+    size = outer.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    safe = torch.where(size > 0, size, torch.ones_like(size))[:, None, None]
+    spread, direction = torch.linalg.eigh(outer / safe)
+    scale = torch.where(size > 0, safe[:, 0, 0].rsqrt(), torch.zeros_like(size))[:, None, None]
+    return scale * direction @ ((spread.clamp_min(0) + eps).rsqrt()[..., None] * direction.mT)

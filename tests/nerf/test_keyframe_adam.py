@@ -1,0 +1,94 @@
+from typing import Any
+
+import pytest
+import torch
+
+from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
+
+
+def descend(optimizer: torch.optim.Optimizer, rows: torch.Tensor, stiffness: torch.Tensor, steps: int) -> float:
+    """Noisy gradients of a quadratic bowl that is steep along some directions and flat along others."""
+    generator = torch.Generator().manual_seed(0)
+    root = torch.linalg.cholesky(stiffness)
+    for _ in range(steps):
+        noise = 0.1 * torch.randn(rows.shape, generator=generator) @ root.mT
+        rows.grad = rows.detach() @ stiffness + noise
+        optimizer.step()
+    return float(rows.detach().norm())
+
+
+def rows_of(value: torch.Tensor) -> torch.Tensor:
+    return torch.nn.Parameter(value.clone())
+
+
+def test_for_rows_of_one_number_it_is_adam():
+    start = torch.linspace(-1, 1, 5)[:, None]
+    ours, theirs = rows_of(start), rows_of(start)
+    one = KeyframeAdam([ours], lr=0.05, betas=(0.9, 0.99), eps=0.0)
+    other = torch.optim.Adam([theirs], lr=0.05, betas=(0.9, 0.99), eps=1e-12)
+    for optimizer, rows in ((one, ours), (other, theirs)):
+        descend(optimizer, rows, torch.eye(1), 50)
+    assert torch.allclose(ours, theirs, atol=1e-5)
+
+
+def test_a_soft_direction_among_stiff_ones_is_followed_sooner_than_by_adam():
+    # The sum of the two is told a thousand times better than their difference.
+    stiffness = torch.tensor([[1.0, 0.999], [0.999, 1.0]])
+    start = torch.tensor([[1.0, -1.0]])
+    way = {}
+    for kind, make in (("ours", KeyframeAdam), ("adam", torch.optim.Adam)):
+        rows = rows_of(start)
+        way[kind] = 2**0.5 - descend(make([rows], lr=0.02, betas=(0.9, 0.99)), rows, stiffness, 150)
+    assert way["ours"] > 10 * way["adam"]
+
+
+def test_turning_the_axes_turns_the_path():
+    turn = torch.linalg.qr(torch.randn(6, 6, generator=torch.Generator().manual_seed(1)))[0]
+    gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
+    plain, turned = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(3, 6))
+    one, other = KeyframeAdam([plain]), KeyframeAdam([turned])
+    for gradient in gradients:
+        plain.grad, turned.grad = gradient, gradient @ turn
+        one.step()
+        other.step()
+    assert torch.allclose(plain @ turn, turned, atol=1e-4)
+
+
+def test_rows_without_a_gradient_stay_and_many_rows_all_move():
+    rows = rows_of(torch.zeros(600, 6))
+    optimizer = KeyframeAdam([rows])
+    rows.grad = torch.randn(600, 6, generator=torch.Generator().manual_seed(0))
+    rows.grad[7] = 0
+    for _ in range(4):
+        optimizer.step()
+    moved = rows.detach().abs().sum(dim=1)
+    assert torch.isfinite(rows).all() and moved[7] == 0 and (moved > 0).sum() == 599
+
+
+@pytest.mark.parametrize("size", [1e-15, 1e12])
+def test_the_size_of_the_loss_does_not_matter(size: float):
+    gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
+    ends = []
+    for factor in (1.0, size):
+        rows = rows_of(torch.zeros(3, 6))
+        optimizer = KeyframeAdam([rows])
+        for gradient in gradients:
+            rows.grad = factor * gradient
+            optimizer.step()
+        ends.append(rows.detach())
+    assert torch.allclose(*ends, atol=1e-4)
+
+
+def test_its_state_goes_on_as_if_never_stopped():
+    gradients = torch.randn(8, 3, 6, generator=torch.Generator().manual_seed(2))
+    whole, stopped = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(3, 6))
+    one, other = KeyframeAdam([whole]), KeyframeAdam([stopped])
+    for k, gradient in enumerate(gradients):
+        whole.grad, stopped.grad = gradient, gradient
+        one.step()
+        other.step()
+        if k == 3:
+            state: dict[str, Any] = other.state_dict()
+            other = KeyframeAdam([stopped])
+            other.load_state_dict(state)
+    assert torch.equal(whole, stopped)
