@@ -19,11 +19,20 @@ class KeyframeAdam(torch.optim.Optimizer):
     2011, with Adam's forgetting): each direction goes by its own noise. For rows of one number this is Adam.
 
     ``eps`` is the share of a row's mean second moment that is added to each direction's. Inverse roots are computed
-    anew for no more than 256 rows a step, in turn; a row stays where it is until its first.
+    anew for no more than 256 rows a step, in turn; a row stays where it is until its first. Not ``coupled``, it scales
+    each number by itself.
     """
 
-    def __init__(self, params: Any, lr: float = 0.03, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-3):
+    def __init__(
+        self,
+        params: Any,
+        lr: float = 0.03,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-3,
+        coupled: bool = True,
+    ):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+        self.coupled = coupled
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -47,7 +56,8 @@ class KeyframeAdam(torch.optim.Optimizer):
         state["mean"].lerp_(gradient, 1 - beta1)
         outer.lerp_(gradient[:, :, None] * gradient[:, None, :], 1 - beta2)
         due = (step * _ROOTS_A_STEP + torch.arange(min(count, _ROOTS_A_STEP), device=rows.device)) % count
-        root[due] = _inverse_root(outer[due] / (1 - beta2 ** (step + 1)), eps)
+        seen = outer[due] if self.coupled else outer[due] * torch.eye(dim).to(outer)
+        root[due] = _inverse_root(seen / (1 - beta2 ** (step + 1)), eps)
         state["step"] = step + 1
         return (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
 

@@ -67,6 +67,8 @@ class EbarfModelConfig(ModelConfig):
     """Points per ray at which the remembered density is looked up for importance sampling."""
     uniform_share: float = 0.25
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
+    most_hidden: float = 0.3
+    """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
     density_cells: int | None = None
     """Cells per side of the remembered density; None: as planned."""
     near: float = 0.05
@@ -115,6 +117,7 @@ class EbarfModel(Model):
             config.sampling,
             config.coarse_samples,
             config.uniform_share,
+            config.most_hidden,
             _planned(config.density_cells),
         )
         self.renderer = Renderer(field, sampling)

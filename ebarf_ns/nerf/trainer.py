@@ -41,6 +41,7 @@ _LEAST = {
     "pipeline.datamanager.longest_pair": 1,
     "pipeline.datamanager.index_memory_gib": 1e-6,
     "pipeline.model.grid_coarsest": 2,
+    "pipeline.model.most_hidden": 1e-6,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
 }
@@ -62,6 +63,9 @@ class KeyframeAdamConfig(OptimizerConfig):
     _target: type = KeyframeAdam
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-3
+    """Share of a keyframe's mean second moment that counts for every direction."""
+    coupled: bool = True
+    """Scale rotation and shift together, so that what tells them apart is followed; else each number by itself."""
 
 
 @dataclass

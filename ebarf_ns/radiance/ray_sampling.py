@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -11,10 +12,6 @@ from ebarf_ns.radiance.field import RadianceField, contract
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-# A cell of the memory is coarser than a silhouette: a ray past an object's edge must find what is behind it, and so an
-# interval that is remembered as dense hides no more than 30 % of what comes after it.
-MOST_OPTICAL_DEPTH = 0.36
 
 
 class Rays(NamedTuple):
@@ -111,20 +108,22 @@ def importance_edges(
     far: Float[Tensor, "rays"],
     coarse: int,
     uniform_share: float,
+    most_hidden: float,
     samples: int,
     jitter: Float[Tensor, "rays 1"],
     pairs: bool,
 ) -> Float[Tensor, "rays samples+1"]:
     """Edges of intervals as dense as the remembered density makes a ray's light come from them.
 
-    ``uniform_share`` of them are spread evenly. With ``pairs``, rays k and k + n/2 share edges, by their mean weights;
-    they must come with the same ``far`` and ``jitter``.
+    The memory's cells are coarser than silhouettes, and a ray past an object's edge must find what is behind it: an
+    interval hides no more than the share ``most_hidden`` of that. ``uniform_share`` of all are spread evenly. With
+    ``pairs``, rays k and k + n/2 share edges, by their mean weights; they must come with the same ``far`` and ``jitter``.
     """
     edges = coarse_edges(near, far, coarse, grid.half_side == 1)
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
     point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
-    remembered = torch.minimum(grid.lookup(point), MOST_OPTICAL_DEPTH / edges.diff(dim=-1).clamp_min(1e-9))
-    weights = weights_of(remembered, edges)
+    most = -math.log1p(-most_hidden) if most_hidden < 1 else math.inf
+    weights = weights_of(torch.minimum(grid.lookup(point), most / edges.diff(dim=-1).clamp_min(1e-9)), edges)
     if pairs:
         weights = weights.unflatten(0, (2, -1)).mean(0).repeat(2, 1)
     # What passes through the scene is spread evenly too.

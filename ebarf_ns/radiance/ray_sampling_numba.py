@@ -9,7 +9,6 @@ import torch
 from numba import njit, prange
 
 from ebarf_ns.radiance.hash_grid_numba import _FAST
-from ebarf_ns.radiance.ray_sampling import MOST_OPTICAL_DEPTH
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,6 +26,7 @@ def importance_edges(
     far: Float[Tensor, "rays"],
     coarse: int,
     uniform_share: float,
+    most_hidden: float,
     samples: int,
     jitter: Float[Tensor, "rays 1"],
     pairs: bool,
@@ -36,7 +36,7 @@ def importance_edges(
     sharing = 2 if pairs else 1
     columns = (rays.origin.contiguous(), rays.direction.contiguous(), far, jitter[:, 0], grid.density)
     origin, direction, ends, shift, density = (column.detach().numpy() for column in columns)
-    settings = np.float32(near), grid.half_side, grid.cells, np.float32(uniform_share)
+    settings = np.float32(near), grid.half_side, grid.cells, np.float32(uniform_share), np.float32(1 - most_hidden)
     scratch = np.empty((len(far) // sharing, coarse + 1), np.float32)
     place: Callable[..., None] = _place
     place(origin, direction, ends, shift, density, *settings, scratch, edges.numpy())
@@ -65,7 +65,9 @@ def _cell(x, y, z, half_side, cells):
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
-def _place(origin, direction, far, jitter, density, near, half_side, cells, uniform_share, cumulative, edges):
+def _place(
+    origin, direction, far, jitter, density, near, half_side, cells, uniform_share, least_passed, cumulative, edges
+):
     groups, coarse = len(cumulative), cumulative.shape[1] - 1
     sharing, samples = len(far) // max(groups, 1), edges.shape[1] - 1
     for group in prange(groups):
@@ -83,8 +85,8 @@ def _place(origin, direction, far, jitter, density, near, half_side, cells, unif
                 x = origin[ray, 0] + middle * direction[ray, 0]
                 y = origin[ray, 1] + middle * direction[ray, 1]
                 z = origin[ray, 2] + middle * direction[ray, 2]
-                remembered = density[_cell(x, y, z, half_side, cells)]
-                passed = np.exp(-min(remembered * (upper - lower), np.float32(MOST_OPTICAL_DEPTH)))
+                passed = np.exp(-density[_cell(x, y, z, half_side, cells)] * (upper - lower))
+                passed = max(passed, least_passed)
                 weights[i + 1] += transmitted * (1 - passed) / sharing
                 transmitted *= passed
                 lower = upper

@@ -44,6 +44,8 @@ class Sampling:
     """Points per ray at which the remembered density is looked up."""
     uniform_share: float = 0.25
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
+    most_hidden: float = 0.3
+    """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
     density_cells: int = 96
     """Cells per side of the remembered density."""
 
@@ -98,6 +100,7 @@ class Renderer(nn.Module):
             far,
             sampling.coarse_samples,
             sampling.uniform_share,
+            sampling.most_hidden,
             sampling.samples,
             jitter,
             pairs_random is not None,

@@ -31,6 +31,18 @@ def test_for_rows_of_one_number_it_is_adam():
     assert torch.allclose(ours, theirs, atol=1e-5)
 
 
+def test_not_coupled_no_number_knows_of_the_others():
+    gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
+    rows, alone = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(18, 1))
+    # Without eps, which is a share of the mean over all six.
+    one, other = KeyframeAdam([rows], eps=0.0, coupled=False), KeyframeAdam([alone], eps=0.0)
+    for gradient in gradients:
+        rows.grad, alone.grad = gradient, gradient.reshape(18, 1)
+        one.step()
+        other.step()
+    assert torch.allclose(rows.reshape(18, 1), alone, atol=1e-5)
+
+
 def test_a_soft_direction_among_stiff_ones_is_followed_sooner_than_by_adam():
     # The sum of the two is told a thousand times better than their difference.
     stiffness = torch.tensor([[1.0, 0.999], [0.999, 1.0]])
