@@ -117,7 +117,7 @@ def importance_edges(
 
     The memory's cells are coarser than silhouettes, and a ray past an object's edge must find what is behind it: an
     interval hides no more than the share ``most_hidden`` of that. ``uniform_share`` of all are spread evenly. With
-    ``pairs``, rays k and k + n/2 share edges, by their mean weights; they must come with the same ``far`` and ``jitter``.
+    ``pairs``, rays k and k + n/2 share edges, by their mean weights, and have the same ``far`` and ``jitter``.
     """
     edges = coarse_edges(near, far, coarse, grid.half_side == 1)
     middle = (edges[:, 1:] + edges[:, :-1]) / 2

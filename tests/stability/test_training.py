@@ -183,9 +183,9 @@ MODEL_CHANGES = {
     "loss": "normalized", "brightness": "lin_log", "intensity_range": "unit", "view_dependent": True, "grid_levels": 5,
     "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
     "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3, "density_bias": 1.0,
-    "contract": True, "precision": "bfloat16", "all_levels_from": 1.0,
+    "most_hidden": 1e-3, "contract": True, "precision": "bfloat16", "all_levels_from": 1.0,
 }  # fmt: skip
-POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
+POSE_CHANGES = {"smooth": False, "interpolation": "linear", "mode": "off", "keyframe_stride": 3}
 DATA_CHANGES = {"train_num_rays_per_batch": 64, "longest_pair": 3, "heldout_share": 0.2, "seed": 5}
 
 
