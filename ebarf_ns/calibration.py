@@ -39,21 +39,26 @@ def read_calibration(path: Path, which: str | None = None, sensor_size: tuple[in
     TUM-VIE's (basalt's) JSON, kalibr's camchain and DSEC's YAML, ROS' camera_info, Robust e-NeRF's npz, a scene.json,
     and the event camera dataset's calib.txt, which needs ``sensor_size``.
     """
-    try:
-        if path.suffix == ".npz":
-            return _robust_e_nerf(path)
-        text = path.read_text(encoding="utf-8")
-        if path.suffix == ".txt":
-            return Calibrated(_nine_numbers(path, text, sensor_size))
-        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(re.sub(r"^%YAML.*\n", "", text))
-    except (OSError, UnicodeDecodeError, ValueError, yaml.YAMLError) as error:
-        raise SceneError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
-    cameras = _cameras(path, content, sensor_size)
+    cameras = read_cameras(path, sensor_size)
     if which is None and len(cameras) == 1:
         return next(iter(cameras.values()))
     if which not in cameras:
         raise SceneError(f"{path}: camera {which or 'not chosen'}, expected one of {', '.join(cameras) or 'none'}")
     return cameras[which]
+
+
+def read_cameras(path: Path, sensor_size: tuple[int, int] | None = None) -> dict[str, Calibrated]:
+    """All cameras of a calibration file by name, see :func:`read_calibration`; raises :class:`SceneError`."""
+    try:
+        if path.suffix == ".npz":
+            return {"camera": _robust_e_nerf(path)}
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".txt":
+            return {"camera": Calibrated(_nine_numbers(path, text, sensor_size))}
+        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(re.sub(r"^%YAML.*\n", "", text))
+    except (OSError, UnicodeDecodeError, ValueError, yaml.YAMLError) as error:
+        raise SceneError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    return _cameras(path, content, sensor_size)
 
 
 def _cameras(path: Path, content: Any, size: tuple[int, int] | None) -> dict[str, Calibrated]:
@@ -66,7 +71,8 @@ def _cameras(path: Path, content: Any, size: tuple[int, int] | None) -> dict[str
             return {"camera": Calibrated(_ros(content))}
         # kalibr's camchain at top level, DSEC's under "intrinsics".
         chain = content.get("intrinsics", content)
-        return {name: _kalibr(entry, size) for name, entry in chain.items() if re.fullmatch(r"cam\w+", name)}
+        entries = {name: entry for name, entry in chain.items() if re.fullmatch(r"cam\w+", name)}
+        return {name: Calibrated(_kalibr(entries[name], size), pose) for name, pose in _chained(entries).items()}
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise SceneError(f"{path}: not a calibration as known ({type(error).__name__}: {error})") from None
 
@@ -121,7 +127,21 @@ def pose_matrix(entry: Mapping[str, float]) -> np.ndarray:
     return matrix
 
 
-def _kalibr(entry: Mapping[str, Any], size: tuple[int, int] | None) -> Calibrated:
+def _chained(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray | None]:
+    """Where kalibr's cameras are: on the IMU where it says so of all, else as seen from the first."""
+    if entries and all("T_cam_imu" in entry for entry in entries.values()):
+        return {name: np.linalg.inv(np.array(entry["T_cam_imu"], float)) for name, entry in entries.items()}
+    found: dict[str, np.ndarray | None] = {}
+    pose: np.ndarray | None = np.eye(4)
+    for number, (name, entry) in enumerate(entries.items()):
+        if number:
+            step = entry.get("T_cn_cnm1")
+            pose = None if pose is None or step is None else pose @ np.linalg.inv(np.array(step, float))
+        found[name] = pose if len(entries) > 1 else None
+    return found
+
+
+def _kalibr(entry: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     intrinsics = entry.get("intrinsics", entry.get("camera_matrix"))
     camera = {
         "model": entry.get("distortion_model", "radtan" if entry.get("distortion_coeffs") else "none"),
@@ -129,8 +149,7 @@ def _kalibr(entry: Mapping[str, Any], size: tuple[int, int] | None) -> Calibrate
         "intrinsics": intrinsics,
         "distortion": entry.get("distortion_coeffs", ()),
     }
-    to_imu = entry.get("T_cam_imu")
-    return Calibrated(_camera(camera, size), None if to_imu is None else np.linalg.inv(np.array(to_imu, float)))
+    return _camera(camera, size)
 
 
 def _ros(content: Mapping[str, Any]) -> Camera:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.calibration import Calibrated, pose_matrix, read_calibration
+from ebarf_ns.calibration import Calibrated, pose_matrix, read_calibration, read_cameras
 from ebarf_ns.errors import SceneError
 from ebarf_ns.events.readers.arrays import read_npy_folder, read_npz
 from ebarf_ns.events.readers.hdf5 import read_hdf5
@@ -100,14 +100,27 @@ def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) ->
     )
 
 
-def eds(folder: Path) -> Ingredients:
-    """EDS (Hidalgo-Carrió et al. 2022): events.h5 with its columns at top level, poses of the event camera."""
-    groundtruth, notes = None, []
-    poses = folder / "stamped_groundtruth.txt"
+def eds(folder: Path, cameras: Path | None = None) -> Ingredients:
+    """EDS (Hidalgo-Carrió et al. 2022): events.h5 with its columns at top level, poses of the event camera.
+
+    The frames, images/ with images_timestamps.txt [us], are another camera's: ``cameras`` says where that is, as a
+    kalibr file with cam0 (frames) and cam1 (events).
+    """
+    groundtruth, notes, frames = None, [], []
+    poses, stamps = folder / "stamped_groundtruth.txt", folder / "images_timestamps.txt"
     if poses.is_file():
         groundtruth, notes = read_trajectory(poses, TrajectoryFormat("s", "xyzw"))
-    notes.append("the frames are another camera's, whose place no file in the folder says: they are left out")
-    return Ingredients(lambda: read_hdf5(folder / "events.h5"), None, groundtruth, notes=notes)
+    known = read_cameras(cameras) if cameras and cameras.suffix == ".yaml" else {}
+    if stamps.is_file() and "cam0" in known and "cam1" in known:
+        event_from_frame = np.linalg.inv(_rig(known["cam1"], cameras)) @ _rig(known["cam0"], cameras)
+        images = sorted((folder / "images").glob("*.png"))
+        frames = [
+            FrameFile(path, t_us, known["cam0"].camera, event_from_frame, "srgb")
+            for path, t_us in zip(images, _times(stamps, len(images)), strict=True)
+        ]
+    elif stamps.is_file():
+        notes.append("the frames are another camera's; without a --camera file that has both, they are left out")
+    return Ingredients(lambda: read_hdf5(folder / "events.h5"), None, groundtruth, tuple(frames), notes=notes)
 
 
 def esim(folder: Path) -> Ingredients:
@@ -160,9 +173,9 @@ def _moved(trajectory: Trajectory, body_from_camera: np.ndarray) -> Trajectory:
     return Trajectory(trajectory.t_us, trajectory.poses.compose(local))
 
 
-def _rig(camera: Calibrated, path: Path) -> np.ndarray:
+def _rig(camera: Calibrated, path: Path | None) -> np.ndarray:
     if camera.rig_from_camera is None:
-        raise SceneError(f"{path}: does not say where the cameras are on the rig, expected T_imu_cam")
+        raise SceneError(f"{path}: does not say where the cameras are on the rig, expected T_imu_cam or T_cn_cnm1")
     return camera.rig_from_camera
 
 

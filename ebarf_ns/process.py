@@ -109,6 +109,8 @@ def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ing
             raise SceneError(f"{source}: a file, expected the folder of a {layout} recording")
         if layout == "ecd" and settings.sensor_size:
             return LAYOUTS[layout](source, settings.sensor_size)
+        if layout == "eds":
+            return LAYOUTS[layout](source, settings.camera)
         return LAYOUTS[layout](source)
     known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]
     known = known or recognised(source)

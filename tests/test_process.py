@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.calibration import read_calibration
+from ebarf_ns.calibration import read_calibration, read_cameras
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError
 from ebarf_ns.events.intake import Intake
 from ebarf_ns.events.recording import read_recording
@@ -86,6 +86,10 @@ def eds(folder: Path) -> Path:
     start_us = 1_600_000_000_000_000
     write_h5(folder / "events.h5", "/", start_us)
     (folder / "stamped_groundtruth.txt").write_text("# t px py pz qx qy qz qw\n" + poses("s", start_us))
+    (folder / "images").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(folder / "images" / f"frame_{k:010d}.png"), np.full((480, 640), 50 * k, np.uint8))
+    (folder / "images_timestamps.txt").write_text("".join(f"{start_us + 500_000 * k}\n" for k in (1, 2, 3)))
     return folder
 
 
@@ -183,6 +187,10 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
     scene = read_scene(tmp_path / "scene")
     assert scene.camera.width == (640 if name == "eds" else 64)
     assert (scene.contrast_threshold is None) == (path.stem == "eds_00")
+    if name == "eds":
+        assert [frame.camera.fx for frame in scene.frames] == pytest.approx([766.536] * 3, abs=1e-3)
+        # The frames' camera is 4.4 mm behind that of the events.
+        assert scene.frames[0].event_camera_from_frame_camera[2][3] == pytest.approx(-0.0044167, abs=1e-6)
 
 
 def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
@@ -260,6 +268,20 @@ def test_calibrations_as_others_write_them(tmp_path: Path, name: str):
     camera = read_calibration(tmp_path / name).camera
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 60, 61, 32, 24)
     assert camera.model == model
+
+
+def test_where_kalibrs_cameras_are(tmp_path: Path):
+    found = read_cameras(REPOSITORY / "configs" / "cameras" / "eds.yaml")
+    first, second = found["cam0"].rig_from_camera, found["cam1"].rig_from_camera
+    assert first is not None and second is not None and np.array_equal(first, np.eye(4))
+    assert np.linalg.inv(second)[0, 2] == pytest.approx(-0.014246672)
+    alone = "cam0:\n  intrinsics: [60.0, 61.0, 32.0, 24.0]\n  resolution: [64, 48]\n"
+    (tmp_path / "alone.yaml").write_text(alone)
+    assert read_calibration(tmp_path / "alone.yaml").rig_from_camera is None
+    on_imu = alone + "  T_cam_imu: [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    (tmp_path / "imu.yaml").write_text(on_imu)
+    pose = read_calibration(tmp_path / "imu.yaml").rig_from_camera
+    assert pose is not None and pose[0, 3] == -0.1
 
 
 @pytest.mark.parametrize("side", ["A", "B"])
