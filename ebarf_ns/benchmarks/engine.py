@@ -298,11 +298,11 @@ class _Step:
         bearing = self.bearing[torch.from_numpy(drawn.pixel).to(_device())].repeat(2, 1)
         rendered = self.renderer(Rays(poses.position, rotate(poses.quat_wxyz, bearing)), self.random)
         before, after = log_brightness(rendered.intensity, "log").chunk(2)
-        polarity_sum, event_count = (
-            torch.from_numpy(column).to(_device()) for column in (drawn.polarity_sum, drawn.event_count)
+        polarity_sum, event_count, variance = (
+            torch.from_numpy(column).to(_device()) for column in (drawn.polarity_sum, drawn.event_count, drawn.variance)
         )
         reported = reported_change(polarity_sum, event_count, 0.25, 0.25).to(before)
-        threshold_loss(after - before, reported, event_count, 0.25).backward()
+        threshold_loss(after - before, reported, variance.to(before), 0.25).backward()
         self.adam.step()
         self.adam.zero_grad()
         self.number += 1

@@ -5,14 +5,15 @@ from jaxtyping import Float
 
 
 def unexplained_share(
-    change: Float[np.ndarray, "pairs"], reported: Float[np.ndarray, "pairs"], event_count: Float[np.ndarray, "pairs"]
+    change: Float[np.ndarray, "pairs"], reported: Float[np.ndarray, "pairs"], variance: Float[np.ndarray, "pairs"]
 ) -> float:
     """Share of the reported brightness changes that the rendered ones leave unexplained: 0 is perfect, 1 is nothing.
 
-    min over a of sum w (r - a c)² / sum w r², w = 1 / events in the pair: one gain is fitted, since events leave the
-    scale of log brightness open where the threshold is unknown, so that the number compares methods and sensors.
+    min over a of sum w (r - a c)² / sum w r², w = 1 / variance (of a pair, its number of events): one gain is fitted,
+    since events leave the scale of log brightness open where the threshold is unknown, so that the number compares
+    methods and sensors.
     """
-    weight = 1 / event_count
+    weight = 1 / variance
     total = float((weight * reported**2).sum())
     if total == 0:
         return float("nan")

@@ -22,11 +22,13 @@ from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.recording import Recording
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Int64, Shaped, UInt8
+    from jaxtyping import Bool, Float, Int64, Shaped, UInt8
 
 _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
+_MOST_MISSED = 2.0
+_ENOUGH_INTERVALS = 20_000
 _MOST_OVER_USUAL, _ALWAYS_COUNT = 20, 1000
 
 
@@ -38,8 +40,11 @@ class EventPairs:
     """Row-major index y * width + x."""
     t0_us: Int64[np.ndarray, "pairs"]
     t1_us: Int64[np.ndarray, "pairs"]
-    polarity_sum: Int64[np.ndarray, "pairs"]
-    event_count: Int64[np.ndarray, "pairs"]
+    polarity_sum: Float[np.ndarray, "pairs"]
+    event_count: Float[np.ndarray, "pairs"]
+    """With an estimate of the events that the pixel was blind for, both are no whole numbers."""
+    variance: Float[np.ndarray, "pairs"]
+    """Of the change that they report, in squared thresholds: one for each event, and the square of the estimate."""
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -86,13 +91,32 @@ class PairIndex:
         pixels = np.searchsorted(self._less_events, -steps)
         return pixels, self.events_before[pixels] - steps * pixels
 
-    def draw(self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator) -> EventPairs:
-        """One pair for each entry of ``steps`` (at most the longest there is), uniform over all so many steps apart."""
+    @cached_property
+    def refractory_us(self) -> int:
+        """How long pixels are blind after an event, as the times between their events tell; 0 where they do not.
+
+        Behind such a time intervals pile up: the one that a thousandth is shorter than is taken for it if a hundredth
+        is shorter than twice that, and half of all are longer still.
+        """
+        if self.count(np.array(1)) < _ENOUGH_INTERVALS:
+            return 0
+        pairs = self.draw(np.ones(_ENOUGH_INTERVALS, np.int64), np.random.default_rng(0))
+        shortest, short, usual = np.quantile(pairs.t1_us - pairs.t0_us, [0.001, 0.01, 0.5])
+        return int(shortest) if short < 2 * shortest < usual else 0
+
+    def draw(
+        self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator, refractory_us: int = 0
+    ) -> EventPairs:
+        """One pair for each entry of ``steps`` (at most the longest there is), uniform over all so many steps apart.
+
+        A pixel that is blind for ``refractory_us`` after each event compares with what it sees then (Low & Lee 2023):
+        pairs begin so much later, and what it missed in between goes by the events before and after.
+        """
         steps = np.minimum(steps, self.max_steps)
         pixels, pairs = self._count(steps)
         order = (self.events_before, self.busiest, self.first, self.events)
-        pixel, t0_us, t1_us, polarity_sum = _look_up(random.integers(pairs), steps, pixels, *order)
-        return EventPairs(pixel, t0_us, t1_us, polarity_sum, steps)
+        pixel, *times_and_sums = _look_up(random.integers(pairs), steps, pixels, *order, refractory_us)
+        return EventPairs(pixel, *times_and_sums)
 
     def draw_accepted(
         self,
@@ -100,6 +124,7 @@ class PairIndex:
         longest: int,
         random: np.random.Generator,
         accepted: Callable[[EventPairs], Bool[np.ndarray, "pairs"]],
+        refractory_us: int = 0,
     ) -> EventPairs:
         """``count`` pairs that ``accepted`` lets through, 1 to ``longest`` steps apart, log-uniformly.
 
@@ -109,17 +134,18 @@ class PairIndex:
         missing = count
         while missing and len(found) < _ROUNDS:
             # As many as are likely to be enough, in later rounds too: few may be accepted.
-            drawn = self.draw(draw_steps(min(2 * missing, count), longest, random), random)
+            drawn = self.draw(draw_steps(min(2 * missing, count), longest, random), random, refractory_us)
             found.append(drawn.select(accepted(drawn)).select(slice(missing)))
             missing -= len(found[-1])
         return EventPairs(*(np.concatenate([getattr(part, c.name) for part in found]) for c in fields(EventPairs)))
 
 
 @njit(cache=True, nogil=True)
-def _look_up(number, steps, pixels, events_before, busiest, first, events):
-    """Pixel, times and polarity sum of pair ``number`` among those ``steps`` apart, counted along ``busiest``."""
-    pixel, total = np.empty(len(number), np.int64), np.empty(len(number), np.int64)
+def _look_up(number, steps, pixels, events_before, busiest, first, events, refractory_us):
+    """What :class:`EventPairs` holds of pair ``number`` among those ``steps`` apart, counted along ``busiest``."""
+    pixel = np.empty(len(number), np.int64)
     t0_us, t1_us = np.empty(len(number), np.int64), np.empty(len(number), np.int64)
+    total, count, variance = np.empty(len(number)), np.empty(len(number)), np.empty(len(number))
     for i in range(len(number)):
         low, high = 0, pixels[i] - 1
         while low < high:
@@ -137,9 +163,25 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events):
             pair = pair * (there_are - steps[i]) // (counted - steps[i])
         last = first[pixel[i]] + steps[i] + pair
         before, after = events[last - steps[i]], events[last]
-        t0_us[i], t1_us[i] = before.t_us, after.t_us
-        total[i] = np.int64(after.running_polarity) - before.running_polarity
-    return pixel, t0_us, t1_us, total
+        t0_us[i], t1_us[i] = min(before.t_us + refractory_us, after.t_us), after.t_us
+        total[i], count[i] = np.int64(after.running_polarity) - before.running_polarity, steps[i]
+        if refractory_us > 0:
+            for k in range(last - steps[i] + 1, last):
+                missed = _missed(events[k - 1], events[k], events[k + 1], refractory_us)
+                total[i] += missed
+                count[i] += abs(missed)
+        variance[i] = steps[i] + (count[i] - steps[i]) ** 2
+    return pixel, t0_us, t1_us, total, count, variance
+
+
+@njit(cache=True, inline="always")
+def _missed(before, event, after, refractory_us):
+    """Events missed right after one, with their sign: at the mean rate of those around it, none where they differ."""
+    polarity = event.running_polarity - before.running_polarity
+    if polarity != after.running_polarity - event.running_polarity:
+        return 0.0
+    seen_us = (after.t_us - before.t_us) / 2 - refractory_us
+    return polarity * refractory_us / max(seen_us, refractory_us / _MOST_MISSED)
 
 
 def index_pairs(

@@ -82,6 +82,8 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Rays of the held-out pairs: two for each."""
     longest_pair: int = 30
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
+    refractory_us: int | None = None
+    """How long a pixel is blind after an event; None: as the recording shows it, 0: not at all."""
     heldout_share: float = 0.05
     """Share of the recording's time whose events are kept for heldout_event_loss."""
     index_memory_gib: float = 4.0
@@ -105,6 +107,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         if self.test_mode == "val":
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
             CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
+            if self.refractory_us:
+                CONSOLE.print(f"pixels are blind for {self.refractory_us:,} us after an event")
 
     def setup_eval(self) -> None:
         """The loaders of full views that nerfstudio's scripts ask for."""
@@ -148,16 +152,23 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return HeldoutBlocks(*self.span_us, self.config.heldout_share)
 
     @cached_property
+    def refractory_us(self) -> int:
+        """How long pixels are taken to be blind after an event."""
+        return self.index.refractory_us if self.config.refractory_us is None else self.config.refractory_us
+
+    @cached_property
     def _training_batches(self) -> DrawAhead:
         # Before there are threads: each of them would make one of its own.
-        _ = self.index
+        _ = self.index, self.refractory_us
         ahead = 1 if torch.device(self.device).type == "cpu" else 4
         return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
 
     def _draw_training_pairs(self, batch: int) -> EventPairs:
         count = self.get_train_rays_per_batch() // 2
         random = batch_random(self.config.seed, batch)
-        pairs = self.index.draw_accepted(count, self.config.longest_pair, random, self._heldout_blocks.training)
+        pairs = self.index.draw_accepted(
+            count, self.config.longest_pair, random, self._heldout_blocks.training, self.refractory_us
+        )
         if len(pairs) < count:
             raise RecordingError(
                 f"{self.train_dataset.scene.events}: next to no pair of events lies outside the held-out "
@@ -170,7 +181,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Pairs that no training sees, the same for every method and seed."""
         count = self.config.eval_num_rays_per_batch // 2
         random = batch_random(_HELDOUT_SEED, 0)
-        return self.index.draw_accepted(count, _LONGEST_HELDOUT_PAIR, random, self._heldout_blocks.heldout)
+        accepted, refractory_us = self._heldout_blocks.heldout, self.index.refractory_us
+        return self.index.draw_accepted(count, _LONGEST_HELDOUT_PAIR, random, accepted, refractory_us)
 
     @cached_property
     def bearings(self) -> torch.Tensor:
@@ -212,4 +224,5 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
             metadata={"event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None]},
         )
-        return bundle, {"polarity_sum": tensor(pairs.polarity_sum), "event_count": tensor(pairs.event_count)}
+        columns = ("polarity_sum", "event_count", "variance")
+        return bundle, {name: tensor(getattr(pairs, name)) for name in columns}

@@ -180,7 +180,7 @@ class EbarfModel(Model):
         reported = reported_change(batch["polarity_sum"], batch["event_count"], *self.thresholds).to(change)
         if self.normalized:
             return {"event_loss": normalized_loss(change, reported)}
-        return {"event_loss": threshold_loss(change, reported, batch["event_count"], sum(self.thresholds) / 2)}
+        return {"event_loss": threshold_loss(change, reported, batch["variance"].to(change), sum(self.thresholds) / 2)}
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """How opaque the scene is, and how far the keyframes have moved."""

@@ -109,7 +109,7 @@ class EbarfPipeline(VanillaPipeline):
         change, counts = (after - before).numpy(), event_count.double().numpy()
         implied = implied_thresholds(change, polarity_sum.double().numpy(), counts)
         return {
-            "heldout_event_loss": unexplained_share(change, reported.numpy(), counts),
+            "heldout_event_loss": unexplained_share(change, reported.numpy(), batch["variance"].cpu().numpy()),
             "implied_threshold_on": implied[0],
             "implied_threshold_off": implied[1],
         }

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int64
+    from jaxtyping import Float
 
 
 def reported_change(
-    polarity_sum: Int64[Tensor, "pairs"],
-    event_count: Int64[Tensor, "pairs"],
+    polarity_sum: Float[Tensor, "pairs"],
+    event_count: Float[Tensor, "pairs"],
     threshold_on: float,
     threshold_off: float,
 ) -> Float[Tensor, "pairs"]:
@@ -25,15 +25,15 @@ def reported_change(
 def threshold_loss(
     change: Float[Tensor, "pairs"],
     reported: Float[Tensor, "pairs"],
-    event_count: Int64[Tensor, "pairs"],
+    variance: Float[Tensor, "pairs"],
     threshold: float,
 ) -> Float[Tensor, ""]:
-    """Eq. 5 in units of the threshold, each pair weighted by one over its number of events; 0 for no pairs.
+    """Eq. 5 in units of the threshold, each pair weighted by one over its variance in that unit; 0 for no pairs.
 
     The errors of the single thresholds add up over the events of a pair, so its variance grows with their number.
     """
     residual = (change - reported) / threshold
-    return (residual * residual / event_count).sum() / max(len(change), 1)
+    return (residual * residual / variance).sum() / max(len(change), 1)
 
 
 def normalized_loss(

@@ -184,3 +184,48 @@ def test_edges_that_have_nearly_all_events_count_in_full():
     x, y = (pixel % 200).astype(np.uint16), (pixel // 200).astype(np.uint16)
     index = index_pairs(lambda: [Recording(x, y, t_us, np.ones(len(pixel), np.int8))], 200, 100)
     assert index.max_steps == 999 and index.events_before[-1] == len(pixel)
+
+
+def spaced(intervals_us: np.ndarray) -> PairIndex:
+    """Brighter events of one pixel with these times between them."""
+    t_us = np.r_[0, np.cumsum(intervals_us)].astype(np.int64)
+    zeros = np.zeros(len(t_us), np.uint16)
+    return index_of(Recording(zeros, zeros, t_us, np.ones(len(t_us), np.int8)))
+
+
+@pytest.mark.parametrize(
+    ("blind_us", "spread_us", "expected"), [(1000, 5000, 1000), (0, 5000, 0), (300, 9000, 300), (5000, 10, 0)]
+)
+def test_how_long_pixels_are_blind_is_seen_where_intervals_pile_up(blind_us: int, spread_us: int, expected: int):
+    random = np.random.default_rng(0)
+    # Some of them soon after, as at edges; and a lamp that flickers is no blind pixel.
+    sizes = np.where(random.random(40_000) < 0.8, spread_us, spread_us / 50)
+    found = spaced(blind_us + random.exponential(sizes) + 1).refractory_us
+    assert found == pytest.approx(expected, rel=0.05, abs=2)
+
+
+def test_few_intervals_say_nothing_of_blind_times():
+    assert spaced(np.full(500, 1000)).refractory_us == 0
+
+
+@pytest.mark.parametrize("steps", [1, 3, 12])
+def test_what_a_blind_pixel_missed_is_estimated(steps: int):
+    # Brightness rises by a threshold in 4 ms; after each event the pixel is blind for 1 ms.
+    index = spaced(np.full(300, 5000))
+    rate_per_us = 1 / 4000
+    pairs = index.draw(np.full(50, steps), np.random.default_rng(0), 1000)
+    assert np.allclose(pairs.polarity_sum, rate_per_us * (pairs.t1_us - pairs.t0_us))
+    assert np.array_equal(pairs.polarity_sum, pairs.event_count) and (pairs.variance >= steps).all()
+    plain = index.draw(np.full(50, steps), np.random.default_rng(0))
+    assert (plain.polarity_sum == steps).all() and (plain.variance == steps).all()
+    assert np.array_equal(plain.t0_us + 1000, pairs.t0_us)
+
+
+def test_nothing_is_missed_where_brightness_turns():
+    polarity = np.array([1, 1, -1, -1, 1, 1], np.int8)
+    zeros = np.zeros(6, np.uint16)
+    index = index_of(Recording(zeros, zeros, np.arange(6) * 2000, polarity))
+    pairs = index.draw(np.array([5]), np.random.default_rng(0), 1000)
+    # Going down, and up again, the pixel is blind half of the time; where it turns, nobody knows.
+    assert pairs.polarity_sum[0] == polarity[1:].sum() - 1 + 1
+    assert (pairs.event_count[0], pairs.variance[0]) == (7, 9)
