@@ -186,7 +186,9 @@ MODEL_CHANGES = {
     "most_hidden": 1e-3, "contract": True, "precision": "bfloat16", "all_levels_from": 1.0,
 }  # fmt: skip
 POSE_CHANGES = {"smooth": False, "interpolation": "linear", "mode": "off", "keyframe_stride": 3}
-DATA_CHANGES = {"train_num_rays_per_batch": 64, "longest_pair": 3, "refractory_us": 2000, "heldout_share": 0.2, "seed": 5}
+DATA_CHANGES = {
+    "train_num_rays_per_batch": 64, "longest_pair": 3, "refractory_us": 2000, "heldout_share": 0.2, "seed": 5
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("key", [*MODEL_CHANGES, *DATA_CHANGES, *POSE_CHANGES])
