@@ -29,7 +29,7 @@ _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 _ROUNDS = 100
 _MOST_MISSED = 2.0
 _ENOUGH_INTERVALS = 20_000
-_MOST_OVER_USUAL, _ALWAYS_COUNT = 20, 1000
+_MOST_OVER_USUAL, _ALWAYS_COUNT = 10, 200
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class EventPairs:
 @dataclass(frozen=True)
 class PairIndex:
     """Events ordered by pixel and time, ready to draw pairs any number of steps apart, uniformly over such pairs
-    but for those of pixels far busier than usual, which are fewer.
+    but for those of hot pixels, which are left out.
 
     Takes 12 bytes an event and 24 a pixel, in memory or in a file.
     """
@@ -67,10 +67,9 @@ class PairIndex:
     first: Int64[np.ndarray, "pixels+1"]
     """Where each pixel's events begin."""
     busiest: Int64[np.ndarray, "pixels"]
-    """Pixels, those with the most events first."""
+    """Pixels, those with the most events first but for the hot ones, which come last and count for nothing."""
     events_before: Int64[np.ndarray, "pixels+1"]
-    """Number of events of all the pixels before each place of ``busiest``; of one pixel, no more count than 20 times
-    what is usual, lest a hot pixel's millions fill the batches."""
+    """Number of events of all the pixels before each place of ``busiest``."""
 
     @property
     def max_steps(self) -> int:
@@ -90,6 +89,11 @@ class PairIndex:
         """Pixels that have pairs that many steps apart, which are the first of ``busiest``, and the pairs in them."""
         pixels = np.searchsorted(self._less_events, -steps)
         return pixels, self.events_before[pixels] - steps * pixels
+
+    @property
+    def hot_pixels(self) -> int:
+        """Number of pixels that are left out for being far busier than usual."""
+        return int(np.count_nonzero(np.diff(self.first)) - np.count_nonzero(self._less_events))
 
     @cached_property
     def refractory_us(self) -> int:
@@ -156,11 +160,6 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events, refra
                 high = middle - 1
         pixel[i] = busiest[low]
         pair = number[i] - (events_before[low] - steps[i] * low)
-        there_are = first[pixel[i] + 1] - first[pixel[i]]
-        counted = events_before[low + 1] - events_before[low]
-        if there_are > counted:
-            # Too busy a pixel: as many of its pairs as count, spread over all of them.
-            pair = pair * (there_are - steps[i]) // (counted - steps[i])
         last = first[pixel[i]] + steps[i] + pair
         before, after = events[last - steps[i]], events[last]
         t0_us[i], t1_us[i] = min(before.t_us + refractory_us, after.t_us), after.t_us
@@ -212,13 +211,15 @@ def index_pairs(
         for chunk in chunks():
             _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
         begin = end
-    busiest = np.argsort(-counts, kind="stable")
-    falling = counts[busiest]
-    return PairIndex(events, first, busiest, np.r_[0, np.minimum(falling, _most_that_count(falling)).cumsum()])
+    counted = np.where(counts > _most_of_a_pixel(counts), 0, counts)
+    busiest = np.argsort(-counted, kind="stable")
+    return PairIndex(events, first, busiest, np.r_[0, counted[busiest].cumsum()])
 
 
-def _most_that_count(falling: np.ndarray) -> int:
-    """20 times what the pixel of a usual event has; hot pixels are few, and do not say what is usual."""
+def _most_of_a_pixel(counts: np.ndarray) -> int:
+    """Events beyond which a pixel is hot: 10 times what the pixel of a usual event has."""
+    falling = np.sort(counts)[::-1]
+    # Hot pixels are few, and do not say what is usual.
     others = falling[len(falling) // 1000 + 1 :]
     if not others.any():
         return int(falling[0])

@@ -107,6 +107,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         if self.test_mode == "val":
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
             CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
+            if self.index.hot_pixels:
+                CONSOLE.print(f"left out {self.index.hot_pixels:,} hot pixels, 10 times busier than usual")
             if self.refractory_us:
                 CONSOLE.print(f"pixels are blind for {self.refractory_us:,} us after an event")
 
