@@ -55,6 +55,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
     model = EbarfModelConfig(
         camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False, keyframe_stride=1, interpolation="linear"),
         loss="normalized",
+        outliers_from=None,
         brightness="lin_log",
         intensity_range="unit",
         view_dependent=True,

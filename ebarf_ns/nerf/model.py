@@ -41,6 +41,8 @@ class EbarfModelConfig(ModelConfig):
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
     loss: Literal["threshold", "normalized"] | None = None
     """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; None: as planned."""
+    outliers_from: float | None = 0.3
+    """Error of an event pair, in its standard deviations, beyond which it counts ever less; None: all squares alike."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -180,7 +182,8 @@ class EbarfModel(Model):
         reported = reported_change(batch["polarity_sum"], batch["event_count"], *self.thresholds).to(change)
         if self.normalized:
             return {"event_loss": normalized_loss(change, reported)}
-        return {"event_loss": threshold_loss(change, reported, batch["variance"].to(change), sum(self.thresholds) / 2)}
+        variance, threshold = batch["variance"].to(change), sum(self.thresholds) / 2
+        return {"event_loss": threshold_loss(change, reported, variance, threshold, self.config.outliers_from)}
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """How opaque the scene is, and how far the keyframes have moved."""

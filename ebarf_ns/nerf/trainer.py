@@ -42,6 +42,7 @@ _LEAST = {
     "pipeline.datamanager.index_memory_gib": 1e-6,
     "pipeline.model.grid_coarsest": 2,
     "pipeline.model.most_hidden": 1e-6,
+    "pipeline.model.outliers_from": 1e-3,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
 }

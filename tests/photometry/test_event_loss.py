@@ -29,3 +29,15 @@ def test_normalized_loss_does_not_know_the_threshold(factor: float):
     change, reported, _ = batch(64)
     assert torch.allclose(normalized_loss(factor * change, reported), normalized_loss(change, reported), rtol=1e-4)
     assert torch.allclose(normalized_loss(change, factor * reported), normalized_loss(change, reported))
+
+
+def test_outliers_count_ever_less_and_small_errors_as_before():
+    reported, variance = torch.zeros(3, dtype=torch.float64), torch.tensor([1.0, 1.0, 4.0], dtype=torch.float64)
+    change = torch.tensor([0.001, 5.0, 10.0], dtype=torch.float64, requires_grad=True)
+
+    def gradient(outliers_from: float | None) -> torch.Tensor:
+        return torch.autograd.grad(threshold_loss(change, reported, variance, 0.25, outliers_from), change)[0]
+
+    plain, robust = gradient(None), gradient(0.3)
+    assert robust[0] == pytest.approx(float(plain[0]), rel=1e-3)
+    assert (robust[1:] < 1e-3 * plain[1:]).all() and (robust > 0).all()
