@@ -32,14 +32,15 @@ def threshold_loss(
     """Eq. 5 in units of the threshold, each pair weighted by one over its variance in that unit; 0 for no pairs.
 
     The errors of the single thresholds add up over the events of a pair, so its variance grows with their number.
-    Errors beyond ``outliers_from`` standard deviations count ever less, d² log(1 + e² / d²) (Cauchy's loss): what a
-    render gets wrong at silhouettes must not bend the trajectory.
+    Errors beyond ``outliers_from`` standard deviations count by their size, no longer by its square (Huber 1964): what
+    a render gets wrong at silhouettes must not bend the trajectory.
     """
-    error = (change - reported) / threshold
-    square = error * error / variance
-    if outliers_from is not None:
-        square = outliers_from**2 * torch.log1p(square / outliers_from**2)
-    return square.sum() / max(len(change), 1)
+    error = (change - reported) / (threshold * variance.sqrt())
+    if outliers_from is None:
+        cost = error * error
+    else:
+        cost = 2 * torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=outliers_from)
+    return cost.sum() / max(len(change), 1)
 
 
 def normalized_loss(

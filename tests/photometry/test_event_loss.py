@@ -31,7 +31,7 @@ def test_normalized_loss_does_not_know_the_threshold(factor: float):
     assert torch.allclose(normalized_loss(change, factor * reported), normalized_loss(change, reported))
 
 
-def test_outliers_count_ever_less_and_small_errors_as_before():
+def test_outliers_count_by_their_size_and_small_errors_by_their_square():
     reported, variance = torch.zeros(3, dtype=torch.float64), torch.tensor([1.0, 1.0, 4.0], dtype=torch.float64)
     change = torch.tensor([0.001, 5.0, 10.0], dtype=torch.float64, requires_grad=True)
 
@@ -39,5 +39,6 @@ def test_outliers_count_ever_less_and_small_errors_as_before():
         return torch.autograd.grad(threshold_loss(change, reported, variance, 0.25, outliers_from), change)[0]
 
     plain, robust = gradient(None), gradient(0.3)
-    assert robust[0] == pytest.approx(float(plain[0]), rel=1e-3)
-    assert (robust[1:] < 1e-3 * plain[1:]).all() and (robust > 0).all()
+    assert robust[0] == pytest.approx(float(plain[0]))
+    # Both are 20 standard deviations off, or 0.3 as far as the gradient goes.
+    assert torch.allclose(robust[1:], plain[1:] * 0.3 / 20)
