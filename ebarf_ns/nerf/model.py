@@ -42,7 +42,7 @@ class EbarfModelConfig(ModelConfig):
     loss: Literal["threshold", "normalized"] | None = None
     """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; None: as planned."""
     outliers_from: float | None = 0.3
-    """Error of an event pair, in its standard deviations, beyond which it counts by its size; None: all by their squares."""
+    """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
