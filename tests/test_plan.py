@@ -109,3 +109,29 @@ def test_inspect_prints_the_plan_a_run_keeps_and_flags_overrule(trained_run: Pat
     text = run_ok("ebarf", "inspect", tiny_scene)
     assert "--pipeline.model.grid-finest" in text and "Eq. 5" in text
     assert "samples: 24" in (trained_run / "config.yml").read_text()
+
+
+def swinging(keyframes: int, uneven: bool = False) -> Trajectory:
+    """Two seconds of turning to and fro, a radian a second at most."""
+    t_us = torch.linspace(0, 2e6, keyframes).round().long()
+    if uneven:
+        t_us[1] = t_us[0] + 1000
+    angle = torch.sin(t_us.double() * 6e-6) / 12
+    quat_wxyz = torch.stack([angle.cos(), 0 * angle, angle.sin(), 0 * angle], dim=-1)
+    return Trajectory(t_us, Poses(torch.zeros(keyframes, 3).double(), quat_wxyz))
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "expected"),
+    [
+        (swinging(41), "cubic"),
+        (swinging(2001), "linear"),
+        (swinging(41, uneven=True), "linear"),
+        (swinging(4), "linear"),
+    ],
+    ids=["20 Hz", "1000 Hz", "uneven", "few"],
+)
+def test_a_spline_only_where_the_motion_between_keyframes_needs_and_carries_it(
+    scene: Scene, trajectory: Trajectory, expected: str
+):
+    assert planned(scene, trajectory=trajectory)["interpolation"] == expected
