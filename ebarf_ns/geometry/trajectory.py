@@ -95,7 +95,7 @@ def interpolate(
     kind: Interpolation = "linear",
 ) -> Poses:
     """The poses at ``t_us``: SLERP of the rotations and LERP of the positions (Eq. 3), or both with velocities that
-    run on through the keyframes, as natural cubic splines have them.
+    run on through the keyframes, as cubic splines have them.
 
     Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
     """
@@ -117,19 +117,23 @@ def _bulge(
     left: Int64[Tensor, "*batch"],
     fraction: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch 6"]:
-    """What natural cubic splines add to straight lines between keyframes: a small rotation in the camera's frame, and
-    a shift.
+    """What cubic splines add to straight lines between keyframes: a small rotation in the camera's frame, and a shift.
 
     The rotations' spline is that of the body's angular velocity. It takes the frames of neighbouring keyframes for
-    the same, which matters as little as the second derivative turns from one to the next.
+    the same, which matters as little as the second derivative turns from one to the next. In the first and the last
+    interval the second derivative is constant: zero at the ends, as of a natural spline, it would bend a motion that
+    is under way when the recording begins, and the end keyframes with it.
     """
     position, quat_wxyz = keyframes
     turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))
     change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)
     interval_s = keyframe_t_us.diff().double() * 1e-6
     slope = change.double() / interval_s[:, None]
+    if len(slope) < 2:
+        return torch.zeros_like(change[left])
     bend = torch.nn.functional.pad(6 * slope.diff(dim=0), (0, 0, 1, 1))
-    curvature: Tensor = _SolveTridiagonal.apply(interval_s, bend).to(position)  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+    solved: Tensor = _SolveTridiagonal.apply(interval_s, bend).to(position)  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+    curvature = torch.cat([solved[1:2], solved[1:-1], solved[-2:-1]])
     u = fraction[..., None]
     before, after = ((1 - u) ** 3 - (1 - u)) * curvature[left], (u**3 - u) * curvature[left + 1]
     return interval_s.to(position)[left][..., None] ** 2 / 6 * (before + after)
@@ -149,12 +153,15 @@ class _SolveTridiagonal(torch.autograd.Function):
 
 
 def _solve_spline_system(interval_s: Tensor, right: Tensor) -> Tensor:
+    """Second derivatives at all keyframes but the first and the last, which have those of their neighbours."""
     from scipy.linalg import solveh_banded
 
-    # First and last row say that the curvature is zero there.
+    # The rows of those two stand for themselves.
     upper_bands = torch.zeros(2, len(interval_s) + 1, dtype=torch.float64)
     upper_bands[0, 2:-1] = interval_s[1:-1]
     upper_bands[1] = 1.0
     upper_bands[1, 1:-1] = 2 * (interval_s[1:] + interval_s[:-1])
+    upper_bands[1, 1] += interval_s[0]
+    upper_bands[1, -2] += interval_s[-1]
     solution = solveh_banded(upper_bands.numpy(), right.detach().cpu().numpy())
     return torch.from_numpy(solution).to(right)

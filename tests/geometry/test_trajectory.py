@@ -3,7 +3,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BarycentricInterpolator, make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
@@ -17,14 +17,22 @@ def keyframes(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> 
     return t_us, Poses(torch.from_numpy(random.standard_normal((count, 3))).to(dtype), torch.from_numpy(quat).to(dtype))
 
 
+def parabolic_at_the_ends(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """A cubic spline whose second derivative is constant in the first and the last interval."""
+    if len(knots) < 4:
+        # Two points have a line, three a parabola.
+        return BarycentricInterpolator(knots, values)(at)
+    flat = [(3, np.zeros(values.shape[1]))]
+    return make_interp_spline(knots, values, k=3, bc_type=(flat, flat))(at)
+
+
 @given(st.integers(0, 50), st.integers(2, 9), st.sampled_from(["linear", "cubic"]))
 def test_agrees_with_scipy(seed: int, count: int, kind: str):
     t_us, poses = keyframes(count, seed)
     t = np.random.default_rng(seed).integers(int(t_us[0]), int(t_us[-1]) + 1, 20)
     found = interpolate(t_us, poses, torch.from_numpy(t), kind)  # pyright: ignore[reportArgumentType]
     if kind == "cubic":
-        # A natural spline through two points is the line.
-        expected = CubicSpline(t_us.numpy() * 1e-6, poses.position.numpy(), bc_type="natural")(t * 1e-6)
+        expected = parabolic_at_the_ends(t_us.numpy() * 1e-6, poses.position.numpy(), t * 1e-6)
     else:
         expected = np.stack([np.interp(t, t_us.numpy(), axis) for axis in poses.position.numpy().T], axis=1)
     assert np.allclose(found.position.numpy(), expected, atol=1e-9)
@@ -35,7 +43,7 @@ def test_agrees_with_scipy(seed: int, count: int, kind: str):
 
 
 def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, float]:
-    """Largest error [m, rad] of a motion that turns and goes to and fro, away from its ends."""
+    """Largest error [m, rad] of a motion that turns and goes to and fro, under way when it begins and when it ends."""
 
     def motion(t_us: np.ndarray) -> tuple[np.ndarray, Rotation]:
         t = t_us[:, None] * 1e-6
@@ -45,7 +53,7 @@ def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, fl
     t_us = np.arange(0, 2_000_001, 1_000_000 // keyframes_per_s)
     position, rotation = motion(t_us)
     poses = Poses(torch.from_numpy(position), torch.from_numpy(rotation.as_quat()[:, [3, 0, 1, 2]]))
-    between = np.random.default_rng(0).integers(500_000, 1_500_000, 500)
+    between = np.random.default_rng(0).integers(0, 2_000_000, 1000)
     found = interpolate(torch.from_numpy(t_us), poses, torch.from_numpy(between), kind)  # pyright: ignore[reportArgumentType]
     true_position, true_rotation = motion(between)
     turned = Rotation.from_quat(found.quat_wxyz.numpy()[:, [1, 2, 3, 0]])
@@ -58,9 +66,8 @@ def test_a_spline_follows_a_smooth_motion_that_lines_cut_short():
         np.array(errors_between_keyframes(*what)) for what in (("linear", 20), ("cubic", 20), ("cubic", 40))
     )
     assert (splines < 0.1 * lines).all()
-    # The error of a cubic goes with the fourth power of the spacing; that of rotations, whose frames turn, at least
-    # with the third.
-    assert splines[0] / finer[0] > 12 and splines[1] / finer[1] > 6
+    # At the ends, and for rotations, whose frames turn, the error goes with the third power of the spacing.
+    assert (splines / finer > 6).all()
 
 
 @pytest.mark.parametrize("kind", ["linear", "cubic"])
