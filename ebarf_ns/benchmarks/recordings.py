@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import date
 from pathlib import Path
 from time import perf_counter
@@ -39,7 +40,7 @@ def run_recordings_benchmark(
 
 
 def _figures(settings: RecordingsBenchmark, folder: Path) -> Iterator[Figure]:
-    targets = {"hdf5": 20.0, "evt3": 5.0, "bag": 5.0, "text": 3.0}
+    targets = {"hdf5": 20.0, "evt3": 5.0, "aedat4": 5.0, "bag": 5.0, "text": 3.0}
     for name, target in targets.items():
         count = settings.events if name == "hdf5" else settings.events // 10
         path = _WRITERS[name](folder, count)
@@ -81,7 +82,7 @@ def write_hdf5(folder: Path, count: int) -> Path:
     path = folder / "events.h5"
     with h5py.File(path, "w") as file:
         made = {
-            name: file.create_dataset(f"events/{name}", (count,), dtype, chunks=(1 << 17,))
+            name: file.create_dataset(f"events/{name}", (count,), dtype, chunks=(min(1 << 17, count),))
             for name, dtype in (("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1"))
         }
         for first in range(0, count, _PIECE):
@@ -99,6 +100,34 @@ def _write_evt3(folder: Path, count: int) -> Path:
             t, x, y, p = _columns(first, min(_PIECE, count - first))
             words = np.stack([0x8000 | (t >> 12) & 0xFFF, 0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x], axis=1)
             file.write(words.astype("<u2").tobytes())
+    return path
+
+
+def aedat4(pieces: Iterable[tuple[np.ndarray, ...]], size: tuple[int, int] = SIZE) -> Iterator[bytes]:
+    """An AEDAT4 file without compression, of pieces of t [us], x, y and polarity: a header and a packet for each."""
+    description = (
+        '<dv version="2.0"><node name="outInfo" path="/"><node name="0" path="/0/">'
+        '<attr key="compression" type="string">NONE</attr><attr key="typeIdentifier" type="string">EVTS</attr>'
+        f'<node name="info" path="/0/info/"><attr key="sizeX" type="int">{size[0]}</attr>'
+        f'<attr key="sizeY" type="int">{size[1]}</attr></node></node></node></dv>'
+    ).encode()
+    # Flatbuffers: where the root is, the kind, and a table: compression, where the packets end (not said), description.
+    table = struct.pack("<5Hi2Iq", 10, 20, 4, 12, 8, 10, 0, 12, -1)
+    header = struct.pack("<I4s6x", 24, b"IOHE") + table + struct.pack("<I", len(description)) + description + b"\0"
+    yield b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header
+    event = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("on", "u1"), ("unused", "V3")])
+    for t, x, y, p in pieces:
+        events = np.zeros(len(t), event)
+        events["t"], events["x"], events["y"], events["on"] = t, x, y, p
+        packet = struct.pack("<I4s2x3Hi2I", 16, b"EVTS", 6, 8, 4, 6, 4, len(t)) + events.tobytes()
+        yield struct.pack("<2iI", 0, 4 + len(packet), len(packet)) + packet
+
+
+def _write_aedat4(folder: Path, count: int) -> Path:
+    path = folder / "events.aedat4"
+    firsts = range(0, count, _EVENTS_A_MESSAGE)
+    with path.open("wb") as file:
+        file.writelines(aedat4(_columns(first, min(_EVENTS_A_MESSAGE, count - first)) for first in firsts))
     return path
 
 
@@ -158,7 +187,9 @@ def _read_rosbags(path: Path) -> None:
             bag.deserialize(raw, connection.msgtype)
 
 
-_WRITERS = {"hdf5": write_hdf5, "evt3": _write_evt3, "bag": _write_bag, "text": _write_text}
+_WRITERS = {
+    "hdf5": write_hdf5, "evt3": _write_evt3, "aedat4": _write_aedat4, "bag": _write_bag, "text": _write_text
+}  # fmt: skip
 _PLAIN: dict[str, dict[str, Callable[[Path], None]]] = {
     "hdf5": {"h5py, the columns alone": _read_h5py},
     "bag": {"rosbags, as Python objects": _read_rosbags},

@@ -10,6 +10,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from ebarf_ns.benchmarks.recordings import aedat4
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.intake import Intake, checked, take_in
 from ebarf_ns.events.recognise import open_recording
@@ -72,6 +73,12 @@ def text(path: Path) -> Path:
     return path
 
 
+def aedat4_file(path: Path) -> Path:
+    t, x, y, p = columns()
+    path.write_bytes(b"".join(aedat4([(t[:100], x[:100], y[:100], p[:100]), (t[100:], x[100:], y[100:], p[100:])])))
+    return path
+
+
 def types(ros: int):
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
     event = EVENT if ros == 1 else EVENT.replace("time ts", "builtin_interfaces/Time ts")
@@ -123,6 +130,7 @@ MADE: dict[str, Callable[[Path], Path]] = {
     "evt21.raw": lambda path: writers.raw(path, "2.1", writers.evt21(EVENTS, swapped=True)),
     "evt3.raw": lambda path: writers.raw(path, "3.0", writers.evt3(EVENTS)),
     "a.dat": lambda path: writers.dat(path, EVENTS),
+    "a.aedat4": aedat4_file,
     "a.npz": npz,
     "raw_events.npz": robust,
     "npy": npy,
