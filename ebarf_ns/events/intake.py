@@ -138,14 +138,25 @@ def _checked(
         _check_values(source.path, piece, width, height)
         lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
         _check_polarity(source.path, piece, lowest, highest)
-        t_us, turned_us = _unwrapped(piece.t_us + turned_us, before_us, turned_us, report)
-        _check_order(source.path, piece, t_us, before_us, intake, report)
+        t_us = piece.t_us + turned_us if turned_us else piece.t_us
+        if _late(t_us, before_us).any():
+            t_us, turned_us = _unwrapped(t_us.copy(), before_us, turned_us, report)
+            _check_order(source.path, piece, t_us, before_us, intake, report)
         before_us = int(t_us[-1]) if before_us is None else max(before_us, int(t_us.max()))
         report.read += len(piece)
         progress(report.read)
-        polarity = np.where(piece.polarity > 0, 1, -1).astype(np.int8)
-        events = Recording(piece.x.astype(np.uint16), piece.y.astype(np.uint16), t_us + intake.time_offset_us, polarity)
-        yield _windowed(events, intake, report)
+        polarity = 2 * (piece.polarity > 0).view(np.int8) - 1
+        x, y = (column.astype(np.uint16, copy=False) for column in (piece.x, piece.y))
+        t_us = t_us + intake.time_offset_us if intake.time_offset_us else t_us
+        yield _windowed(Recording(x, y, t_us, polarity), intake, report)
+
+
+def _late(t_us: Int64[np.ndarray, "events"], before_us: int | None) -> Bool[np.ndarray, "events"]:
+    """Which events are earlier than the one before."""
+    late = np.empty(len(t_us), bool)
+    late[0] = before_us is not None and t_us[0] < before_us
+    np.less(t_us[1:], t_us[:-1], out=late[1:])
+    return late
 
 
 def _check_values(path: Path, piece: Piece, width: int, height: int) -> None:
@@ -189,8 +200,7 @@ def _unwrapped(
     t_us: Int64[np.ndarray, "events"], before_us: int | None, turned_us: int, report: IntakeReport
 ) -> tuple[Int64[np.ndarray, "events"], int]:
     """Times that run on where a counter of 31 or 32 bits began anew, which leaves no doubt at such values."""
-    late = np.flatnonzero(np.diff(t_us, prepend=t_us[0] if before_us is None else before_us) < 0)
-    for k in late.tolist():
+    for k in np.flatnonzero(_late(t_us, before_us)).tolist():
         before = int(t_us[k - 1]) if k else before_us
         assert before is not None
         for wrap_us in _WRAPS_US:
@@ -208,7 +218,7 @@ def _unwrapped(
 def _check_order(
     path: Path, piece: Piece, t_us: np.ndarray, before_us: int | None, intake: Intake, report: IntakeReport
 ) -> None:
-    late = np.diff(t_us, prepend=t_us[0] if before_us is None else before_us) < 0
+    late = _late(t_us, before_us)
     if not late.any():
         return
     k = int(late.argmax())

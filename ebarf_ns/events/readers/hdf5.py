@@ -108,7 +108,8 @@ def _pieces(path: Path, group: str) -> Iterator[Piece]:
             count = len(_dataset(columns["t"]))
             for first in range(0, count, _EVENTS_AT_ONCE):
                 x, y, t, p = (_slice(columns[role], first) for role in "xytp")
-                yield Piece(x, y, _microseconds(path, group, t, first) + offset_us, p, numbered(first, "row"))
+                t_us = _microseconds(path, group, t, first)
+                yield Piece(x, y, t_us + offset_us if offset_us else t_us, p, numbered(first, "row"))
     except _DAMAGES as error:
         hint = ""
         if f"{_ECF_FILTER}" in str(error):
@@ -143,7 +144,7 @@ def _check(path: Path, group: str, columns: Columns) -> None:
 def _microseconds(path: Path, group: str, t: np.ndarray, first: int) -> np.ndarray:
     """Integers are microseconds, float64 are seconds."""
     if t.dtype.kind != "f":
-        return t.astype(np.int64)
+        return t.astype(np.int64, copy=False)
     if not np.isfinite(t).all() or np.abs(t).max(initial=0) > 1e12:
         row = int(np.argmax(~(np.abs(t) <= 1e12)))
         raise RecordingError(f"{path}: /{group} row {first + row:,} is at {t[row]} s, expected a finite time")
