@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
@@ -36,8 +37,8 @@ class Calibrated:
 def read_calibration(path: Path, which: str | None = None, sensor_size: tuple[int, int] | None = None) -> Calibrated:
     """The camera named or numbered ``which``, the only one where not given; raises :class:`SceneError`.
 
-    TUM-VIE's (basalt's) JSON, kalibr's camchain and DSEC's YAML, ROS' camera_info, Robust e-NeRF's npz, a scene.json,
-    and the event camera dataset's calib.txt, which needs ``sensor_size``.
+    TUM-VIE's (basalt's) JSON, kalibr's camchain and DSEC's YAML, ROS' camera_info, Robust e-NeRF's npz, M3ED's h5, a
+    scene.json, and the event camera dataset's calib.txt, which needs ``sensor_size``.
     """
     cameras = read_cameras(path, sensor_size)
     if which is None and len(cameras) == 1:
@@ -52,6 +53,8 @@ def read_cameras(path: Path, sensor_size: tuple[int, int] | None = None) -> dict
     try:
         if path.suffix == ".npz":
             return {"camera": _robust_e_nerf(path)}
+        if path.suffix in (".h5", ".hdf5"):
+            return _m3ed(path)
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".txt":
             return {"camera": Calibrated(_nine_numbers(path, text, sensor_size))}
@@ -174,6 +177,27 @@ def _nine_numbers(path: Path, text: str, sensor_size: tuple[int, int] | None) ->
         raise SceneError(f"{path}: does not say how large the sensor is, expected --sensor-size")
     fx, fy, cx, cy, *distortion = values
     return Camera("radtan", *sensor_size, fx, fy, cx, cy, tuple(distortion))
+
+
+def _m3ed(path: Path) -> dict[str, Calibrated]:
+    """The cameras among the groups with a ``calib``, by the groups' names; the rig is the left event camera."""
+    found: dict[str, Calibrated] = {}
+    with h5py.File(path, "r") as file:
+        groups: list[str] = []
+        file.visit(lambda name: groups.append(name.removesuffix("/calib")) if name.endswith("/calib") else None)
+        for name in groups:
+            calibration = {key: np.asarray(value) for key, value in file[f"{name}/calib"].items()}  # pyright: ignore[reportAttributeAccessIssue]
+            if not {"intrinsics", "resolution", "distortion_model", "distortion_coeffs"} <= calibration.keys():
+                continue
+            model = calibration["distortion_model"].item()
+            camera = {
+                "model": model.decode() if isinstance(model, bytes) else model,
+                "resolution": calibration["resolution"].tolist(),
+                "intrinsics": calibration["intrinsics"].tolist(),
+                "distortion": calibration["distortion_coeffs"].tolist(),
+            }
+            found[name] = Calibrated(_camera(camera, None), calibration.get("T_to_prophesee_left"))
+    return found
 
 
 def _robust_e_nerf(path: Path) -> Calibrated:

@@ -270,6 +270,27 @@ def test_calibrations_as_others_write_them(tmp_path: Path, name: str):
     assert camera.model == model
 
 
+def test_calibrations_within_a_recording_of_m3ed(tmp_path: Path):
+    with h5py.File(tmp_path / "data.h5", "w") as file:
+        for name, shift in (("prophesee/left", 0.0), ("ovc/left", 0.1)):
+            calibration = file.create_group(f"{name}/calib")
+            calibration["intrinsics"], calibration["resolution"] = [60.0, 61.0, 32.0, 24.0], [64, 48]
+            calibration["distortion_model"], calibration["distortion_coeffs"] = "radtan", [-0.1, 0.1, 0.0, 0.0]
+            pose = np.eye(4)
+            pose[0, 3] = shift
+            calibration["T_to_prophesee_left"] = pose
+        file.create_group("ouster/calib")["T_to_prophesee_left"] = np.eye(4)
+    found = read_cameras(tmp_path / "data.h5")
+    assert set(found) == {"prophesee/left", "ovc/left"} and found["ovc/left"].camera.model == "radtan"
+    pose = found["ovc/left"].rig_from_camera
+    assert pose is not None and pose[0, 3] == 0.1
+    with pytest.raises(SceneError, match="expected one of ovc/left, prophesee/left"):
+        read_calibration(tmp_path / "data.h5")
+    (tmp_path / "none.h5").write_bytes(b"nothing")
+    with pytest.raises(SceneError, match="cannot be read"):
+        read_calibration(tmp_path / "none.h5")
+
+
 def test_where_kalibrs_cameras_are(tmp_path: Path):
     found = read_cameras(REPOSITORY / "configs" / "cameras" / "eds.yaml")
     first, second = found["cam0"].rig_from_camera, found["cam1"].rig_from_camera

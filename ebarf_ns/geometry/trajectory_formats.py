@@ -12,6 +12,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import IO, Literal
 
+import h5py
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -75,7 +76,8 @@ def read_trajectory(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> tupl
     """Poses in order of time, and what was recognised; raises :class:`TrajectoryError`.
 
     TUM text in any unit, TUM-VIE's ``mocap_data.txt``, EDS' ground truth, KITTI, COLMAP's ``images.txt`` and
-    ``images.bin`` (or the folder of either), LLFF's ``poses_bounds.npy``, Robust e-NeRF's ``camera_poses.npz``.
+    ``images.bin`` (or the folder of either), LLFF's ``poses_bounds.npy``, Robust e-NeRF's ``camera_poses.npz``,
+    M3ED's ``*_pose_gt.h5``.
     """
     raw = _read(path, known)
     unit = known.pose_time_unit or raw.time_unit or _recognised_unit(path, raw.times)
@@ -158,6 +160,8 @@ def _read(path: Path, known: TrajectoryFormat) -> _Raw:
             return _robust_e_nerf(path)
         if path.suffix == ".npy":
             return _llff(path, known)
+        if path.suffix in (".h5", ".hdf5"):
+            return _m3ed(path)
         if path.suffix == ".bin":
             return _colmap(path, _colmap_binary(path), known)
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -237,6 +241,17 @@ def _robust_e_nerf(path: Path) -> _Raw:
         times = [Decimal(int(t)) for t in file["T_wc_timestamp"]]
         position, rotation = file["T_wc_position"].astype(float), file["T_wc_orientation"].astype(float)
     return _Raw("Robust e-NeRF npz", times, position, rotation, "xyzw", time_unit="ns")
+
+
+def _m3ed(path: Path) -> _Raw:
+    """Chaney et al. 2023: ``Cn_T_C0`` brings points of the first event camera, which is the world, into the n-th."""
+    with h5py.File(path, "r") as file:
+        matrices, times = np.asarray(file["Cn_T_C0"], float), np.asarray(file["ts"])
+    if matrices.shape != (len(times), 4, 4):
+        raise TrajectoryError(f"{path}: Cn_T_C0 is of shape {matrices.shape}, expected ({len(times)}, 4, 4)")
+    rotation = _rotations(path, matrices[:, :3, :3])
+    times = [Decimal(str(time)) for time in times.tolist()]
+    return _Raw("M3ED poses", times, matrices[:, :3, 3], rotation, None, "world-to-camera", time_unit="us")
 
 
 def _llff(path: Path, known: TrajectoryFormat) -> _Raw:

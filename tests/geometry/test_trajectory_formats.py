@@ -3,6 +3,7 @@
 import struct
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -129,6 +130,20 @@ def test_llff(tmp_path: Path):
     np.save(tmp_path / "poses_bounds.npy", np.hstack([table, np.ones((COUNT, 2))]))
     (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
     check(read_trajectory(tmp_path / "poses_bounds.npy", TrajectoryFormat(pose_times=tmp_path / "times.txt"))[0])
+
+
+def test_m3ed(tmp_path: Path):
+    world_to_camera = np.linalg.inv([np.vstack([m, [0, 0, 0, 1]]) for m in matrices()])
+    with h5py.File(tmp_path / "pose_gt.h5", "w") as file:
+        file["Cn_T_C0"], file["ts"] = world_to_camera, np.array(T_US, float)
+    check(read_trajectory(tmp_path / "pose_gt.h5")[0])
+    with h5py.File(tmp_path / "short.h5", "w") as file:
+        file["Cn_T_C0"], file["ts"] = world_to_camera[:2], np.array(T_US, float)
+    with pytest.raises(TrajectoryError, match="Cn_T_C0 is of shape"):
+        read_trajectory(tmp_path / "short.h5")
+    (tmp_path / "none.h5").write_bytes(b"nothing")
+    with pytest.raises(TrajectoryError, match="cannot be read"):
+        read_trajectory(tmp_path / "none.h5")
 
 
 def test_robust_e_nerf(tmp_path: Path):
