@@ -20,6 +20,7 @@ from ebarf_ns.process import ProcessSettings, process
 from ebarf_ns.scene import read_scene
 from tests.conftest import DATA, REPOSITORY, run_command, run_ok
 from tests.events import writers
+from tests.events.test_recognise import bag1
 
 SECONDS = 2.0
 EVENTS: list[writers.Event] = [(t, t // 1000 % 64, t // 3000 % 48, t // 7000 % 2) for t in range(0, 2_000_000, 1000)]
@@ -91,6 +92,10 @@ def eds(folder: Path) -> Path:
         cv2.imwrite(str(folder / "images" / f"frame_{k:010d}.png"), np.full((480, 640), 50 * k, np.uint8))
     (folder / "images_timestamps.txt").write_text("".join(f"{start_us + 500_000 * k}\n" for k in (1, 2, 3)))
     return folder
+
+
+def evo(path: Path) -> Path:
+    return bag1(path.with_suffix(".bag"), EVENTS, (240, 180))
 
 
 def esim(folder: Path) -> Path:
@@ -174,10 +179,11 @@ def test_a_scene_of_a_recording_and_an_odometry(tmp_path: Path):
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda path: path.stem)
 def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
     name = path.stem.split("_")[0]
-    if name == "evo":
-        pytest.skip("a bag; its reader has tests of its own")
-    source = MADE[name](tmp_path / "source")
+    source = evo(tmp_path / "source") if name == "evo" else MADE[name](tmp_path / "source")
     words = ["ebarf", "process", "--config", path, "--source", source, "--output", tmp_path / "scene"]
+    if name == "evo":
+        (tmp_path / "odometry.txt").write_text(poses("s"))
+        words += ["--trajectory", tmp_path / "odometry.txt"]
     if name == "eds":
         # The real camera is larger than the events here need.
         words += ["--start-us", 1_600_000_000_000_000]
@@ -185,8 +191,8 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
         words += ["--start-us", 0]
     run_ok(*words)
     scene = read_scene(tmp_path / "scene")
-    assert scene.camera.width == (640 if name == "eds" else 64)
-    assert (scene.contrast_threshold is None) == (path.stem == "eds_00")
+    assert scene.camera.width == {"eds": 640, "evo": 240}.get(name, 64)
+    assert (scene.contrast_threshold is None) == (path.stem in ("eds_00", "evo_flyingroom"))
     if name == "eds":
         assert [frame.camera.fx for frame in scene.frames] == pytest.approx([766.536] * 3, abs=1e-3)
         # The frames' camera is 4.4 mm behind that of the events.

@@ -87,27 +87,27 @@ def types(ros: int):
     return store
 
 
-def messages(store) -> list:
+def messages(store, events: list[writers.Event], size: tuple[int, int]) -> list:
     of = store.types
     header = of["std_msgs/msg/Header"]
     time = of["builtin_interfaces/msg/Time"]
     found = []
-    for first in range(0, len(EVENTS), 100):
+    for first in range(0, len(events), 100):
         some = [
             of["dvs_msgs/msg/Event"](x, y, time(t // 10**6, t % 10**6 * 1000), bool(p))
-            for t, x, y, p in EVENTS[first : first + 100]
+            for t, x, y, p in events[first : first + 100]
         ]
         arguments = (time(0, 0), "camera")
         head = header(0, *arguments) if "seq" in header.__dataclass_fields__ else header(*arguments)
-        found.append(of["dvs_msgs/msg/EventArray"](head, 480, 640, some))
+        found.append(of["dvs_msgs/msg/EventArray"](head, size[1], size[0], some))
     return found
 
 
-def bag1(path: Path) -> Path:
+def bag1(path: Path, events: list[writers.Event] = EVENTS, size: tuple[int, int] = SIZE) -> Path:
     store = types(1)
     with Writer1(path) as bag:
         connection = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
-        for k, message in enumerate(messages(store)):
+        for k, message in enumerate(messages(store, events, size)):
             bag.write(connection, 10**9 + k, store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
     return path
 
@@ -116,7 +116,7 @@ def bag2(path: Path) -> Path:
     store = types(2)
     with Writer2(path, version=9) as bag:
         connection = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
-        for k, message in enumerate(messages(store)):
+        for k, message in enumerate(messages(store, EVENTS, SIZE)):
             bag.write(connection, 10**9 + k, store.serialize_cdr(message, "dvs_msgs/msg/EventArray"))
     return path
 
