@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.readers.ecf import decode
 from ebarf_ns.events.readers.prophesee import Decoder, read_dat, read_raw
 from tests.conftest import DATA
 from tests.events import writers
@@ -109,3 +110,22 @@ def test_a_real_camera():
     assert max(int(piece.x.max()) for piece in pieces) < 640 and max(int(piece.y.max()) for piece in pieces) < 480
     t_us = np.concatenate([piece.t_us for piece in pieces])
     assert (np.diff(t_us) >= 0).all()
+
+
+ECF_EVENTS = st.lists(
+    st.tuples(st.integers(0, 400), st.integers(0, 30), st.integers(0, 3), st.integers(0, 1)), min_size=1, max_size=300
+)
+
+
+@pytest.mark.parametrize("layout", ["packed", "runs and packed", "runs and masks"])
+@given(events=ECF_EVENTS, far_us=st.integers(0, 1 << 40))
+def test_ecf_blocks_read_back_and_cut_ones_are_refused(layout: str, events: list[writers.Event], far_us: int):
+    # Runs of equal times, of none, and a long silence in the middle.
+    half = len(events) // 2
+    made = [(t + (far_us if k >= half else 0), x, y, p) for k, (t, x, y, p) in enumerate(sorted(events))]
+    content = writers.ecf(made, layout)
+    x, y, t_us, p = decode(content)
+    assert list(zip(t_us.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True)) == made
+    for place in (0, 3, 11, 12, len(content) // 2, len(content) - 1):
+        with pytest.raises(ValueError, match="ECF block"):
+            decode(content[:place])

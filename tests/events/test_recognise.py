@@ -126,6 +126,8 @@ MADE: dict[str, Callable[[Path], Path]] = {
     "eds.h5": lambda path: hdf5(path, "/"),
     "m3ed.h5": lambda path: hdf5(path, "prophesee/left"),
     "prophesee.hdf5": compound,
+    "ecf.hdf5": lambda path: writers.ecf_file(path, EVENTS, ["packed", "runs and packed", "runs and masks"]),
+    "ecf-plain.hdf5": lambda path: writers.ecf_file(path, EVENTS, ["as they are", "packed"]),
     "evt2.raw": lambda path: writers.raw(path, "2.0", writers.evt2(EVENTS)),
     "evt21.raw": lambda path: writers.raw(path, "2.1", writers.evt21(EVENTS, swapped=True)),
     "evt3.raw": lambda path: writers.raw(path, "3.0", writers.evt3(EVENTS)),

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.readers import ecf
 from ebarf_ns.events.source import Piece, Source, numbered
 
 with suppress(ImportError):
@@ -24,8 +26,6 @@ _NAMES = {
     "p": ("p", "ps", "pol", "polarity", "polarities", "on"),
 }  # fmt: skip
 _EVENTS_AT_ONCE = 1 << 20
-# Prophesee's own compression, whose decoder no package brings.
-_ECF_FILTER = 36559
 # What the library raises for one damage or another.
 _DAMAGES = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
 Columns = dict[str, h5py.Dataset | tuple[h5py.Dataset, str]]
@@ -106,15 +106,39 @@ def _pieces(path: Path, group: str) -> Iterator[Piece]:
             _check(path, group, columns)
             offset_us = int(np.asarray(file["t_offset"]).item()) if "t_offset" in file else 0
             count = len(_dataset(columns["t"]))
+            if _is_ecf(_dataset(columns["t"])):
+                yield from _ecf_pieces(_dataset(columns["t"]), offset_us)
+                return
             for first in range(0, count, _EVENTS_AT_ONCE):
                 x, y, t, p = (_slice(columns[role], first) for role in "xytp")
                 t_us = _microseconds(path, group, t, first)
                 yield Piece(x, y, t_us + offset_us if offset_us else t_us, p, numbered(first, "row"))
     except _DAMAGES as error:
-        hint = ""
-        if f"{_ECF_FILTER}" in str(error):
-            hint = "; that is Prophesee's ECF compression: export the recording as .raw, or uncompressed"
-        raise RecordingError(f"{path}: /{group} cannot be read ({_one_line(error)}){hint}") from None
+        raise RecordingError(f"{path}: /{group} cannot be read ({_one_line(error)})") from None
+
+
+def _is_ecf(table: h5py.Dataset) -> bool:
+    """Whether a table is compressed as Prophesee does it, by a filter whose library no package brings."""
+    settings = table.id.get_create_plist()
+    return any(settings.get_filter(k)[0] == ecf.FILTER for k in range(settings.get_nfilters()))
+
+
+def _ecf_pieces(table: h5py.Dataset, offset_us: int) -> Iterator[Piece]:
+    assert table.chunks is not None
+    size = table.chunks[0]
+    for first in range(0, len(table), size):
+        skipped, content = table.id.read_direct_chunk((first,))
+        if skipped:
+            rows: Any = np.frombuffer(content, table.dtype)
+            columns = rows["x"], rows["y"], rows["t"].astype(np.int64), rows["p"].astype(np.int8)
+        else:
+            columns = ecf.decode(content)
+        # The last chunk may be full of what is no event any more.
+        count = min(size, len(table) - first)
+        if len(columns[0]) < count:
+            raise ValueError(f"the chunk at row {first:,} holds {len(columns[0]):,} of its {count:,} events")
+        x, y, t_us, p = (column[:count] for column in columns)
+        yield Piece(x, y, t_us + offset_us, p, numbered(first, "row"))
 
 
 def _one_line(error: Exception) -> str:

@@ -1,0 +1,149 @@
+"""ECF, the compression of Prophesee's HDF5 files: runs of equal times, rows and polarities, and packed numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from jaxtyping import Int64, UInt8, UInt16
+
+FILTER = 36559
+_HEADER_BYTES = 12
+_MOST_EVENTS = 65535
+
+
+def decode(
+    content: bytes,
+) -> tuple[UInt16[np.ndarray, "n"], UInt16[np.ndarray, "n"], Int64[np.ndarray, "n"], UInt8[np.ndarray, "n"]]:
+    """Columns x, y, t [us] and polarity (0 or 1) of a block; raises :class:`ValueError` where it is none, or cut."""
+    if len(content) < _HEADER_BYTES:
+        raise ValueError(f"an ECF block of {len(content)} bytes, expected {_HEADER_BYTES} or more")
+    raw = np.frombuffer(content, np.uint8)
+    header, origin_us = int(raw[:4].view("<u4")[0]), int(raw[4:12].view("<i8")[0])
+    count = header >> 2
+    if count > _MOST_EVENTS:
+        raise ValueError(f"an ECF block of {count} events, expected at most {_MOST_EVENTS}")
+    x, y, p = np.empty(count, np.uint16), np.empty(count, np.uint16), np.empty(count, np.uint8)
+    t_us = np.empty(count, np.int64)
+    place = _times(raw, _HEADER_BYTES, origin_us, t_us)
+    if header & 2:
+        place = _rows_columns_polarities(raw, place, x, y, p)
+    else:
+        place = _runs(raw, place, 2, 5, y)
+        if header & 1:
+            place = _columns_polarities(raw, place, x, p)
+        else:
+            place = _runs(raw, _masked_columns(raw, place, x), 1, 7, p)
+    if place < 0:
+        raise ValueError(f"an ECF block of {len(content)} bytes ends within its {count} events")
+    return x, y, t_us, p
+
+
+@njit(cache=True)
+def _times(raw, place, now_us, t_us):
+    """Bytes of a step (upper half) and a run's length (lower half, 15: two more bytes); or, where the upper half is 15,
+    a digit of a longer step, the lowest first."""
+    i = 0
+    while i < len(t_us):
+        if place >= len(raw):
+            return -1
+        step, run = np.int64(raw[place] >> 4), np.int64(raw[place] & 15)
+        place += 1
+        if step == 15:
+            shift = 0
+            while True:
+                if shift > 56 or place >= len(raw):
+                    return -1
+                now_us += run << shift
+                if raw[place] >> 4 != 15:
+                    break
+                run, shift, place = np.int64(raw[place] & 15), shift + 4, place + 1
+            continue
+        if run == 15:
+            if place + 2 > len(raw):
+                return -1
+            run, place = raw[place] | np.int64(raw[place + 1]) << 8, place + 2
+        if not 0 < run <= len(t_us) - i:
+            return -1
+        now_us += step
+        t_us[i : i + run] = now_us
+        i += run
+    return place
+
+
+@njit(cache=True, inline="always")
+def _word(raw, place, size):
+    """``size`` bytes, the lowest first."""
+    value = np.int64(0)
+    for k in range(size):
+        value |= np.int64(raw[place + k]) << (8 * k)
+    return value
+
+
+@njit(cache=True)
+def _runs(raw, place, size, bits, values):
+    """Words of ``size`` bytes: a value above the length of its run, of ``bits``; all ones: two more bytes say it."""
+    i, most = 0, (1 << bits) - 1
+    while i < len(values):
+        if place < 0 or place + size > len(raw):
+            return -1
+        word = _word(raw, place, size)
+        run, place = word & most, place + size
+        if run == most:
+            if place + 2 > len(raw):
+                return -1
+            run, place = _word(raw, place, 2), place + 2
+        if not 0 < run <= len(values) - i:
+            return -1
+        values[i : i + run] = word >> bits
+        i += run
+    return place
+
+
+@njit(cache=True)
+def _masked_columns(raw, place, x):
+    """Two bytes: a column above a mask of which of the next five follow."""
+    i = 0
+    while i < len(x):
+        if place < 0 or place + 2 > len(raw):
+            return -1
+        word = _word(raw, place, 2)
+        place += 2
+        x[i] = word >> 5
+        i += 1
+        for k in range(5):
+            if word & (16 >> k) and i < len(x):
+                x[i] = (word >> 5) + k + 1
+                i += 1
+    return place
+
+
+@njit(cache=True)
+def _columns_polarities(raw, place, x, p):
+    """Four numbers of 12 bits, column and polarity, in three words of two bytes."""
+    for i in range(0, len(x), 4):
+        if place < 0 or place + 6 > len(raw):
+            return -1
+        a, b, c = _word(raw, place, 2), _word(raw, place + 2, 2), _word(raw, place + 4, 2)
+        place += 6
+        four = (a >> 4, a & 15 | b >> 8 << 4, b & 255 | c >> 12 << 8, c & 4095)
+        for k in range(min(4, len(x) - i)):
+            x[i + k], p[i + k] = four[k] >> 1, four[k] & 1
+    return place
+
+
+@njit(cache=True)
+def _rows_columns_polarities(raw, place, x, y, p):
+    """Four numbers of 24 bits, row, column and polarity, in three words of four bytes."""
+    for i in range(0, len(x), 4):
+        if place < 0 or place + 12 > len(raw):
+            return -1
+        a, b, c = _word(raw, place, 4), _word(raw, place + 4, 4), _word(raw, place + 8, 4)
+        place += 12
+        four = (a >> 8, a & 0xFF | b >> 16 << 8, b & 0xFFFF | c >> 24 << 16, c & 0xFFFFFF)
+        for k in range(min(4, len(x) - i)):
+            y[i + k], x[i + k], p[i + k] = four[k] >> 12 & 2047, four[k] >> 1 & 2047, four[k] & 1
+    return place
