@@ -154,6 +154,19 @@ def test_the_same_events_come_out_of_every_format(tmp_path: Path, name: str):
         assert np.array_equal(getattr(back, column), getattr(expected, column)), column
 
 
+@pytest.mark.parametrize("name", list(MADE))
+@pytest.mark.parametrize("size", [1, 7])
+def test_pieces_of_any_size_are_the_same_events(tmp_path: Path, name: str, size: int, monkeypatch: pytest.MonkeyPatch):
+    path, expected = MADE[name](tmp_path / name), writers.recording(EVENTS)
+    monkeypatch.setattr("ebarf_ns.events.readers.hdf5._EVENTS_AT_ONCE", size)
+    monkeypatch.setattr("ebarf_ns.events.readers.arrays._EVENTS_AT_ONCE", size)
+    monkeypatch.setattr("ebarf_ns.events.readers.prophesee._BYTES_AT_ONCE", 8 * size)
+    monkeypatch.setattr("ebarf_ns.events.readers.text._BLOCK_BYTES", 8 * size)
+    back = checked(open_recording(path), SIZE)
+    for column in ("x", "y", "t_us", "polarity"):
+        assert np.array_equal(getattr(back, column), getattr(expected, column)), column
+
+
 SINGLE = [name for name in MADE if name not in ("npy", "ros2")]
 
 
