@@ -59,7 +59,8 @@ def plan_for(
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
-    stride, straight = _stride(scene, trajectory)
+    smooth, distance = smoothed(trajectory), _distance(scene, trajectory)[0] if scene.bounds is not None else None
+    stride, straight = _stride(smooth, scene.camera.fx, distance)
     precision = fastest_precision(device)
     threshold, bounded = scene.contrast_threshold, scene.bounds is not None
     rays = 16384 if device == "cuda" else 1024
@@ -101,7 +102,7 @@ def plan_for(
             "this processor multiplies bfloat16 natively" if precision == "bfloat16" else "no native bfloat16 here",
         ),
         Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
-        Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(scene, trajectory)),
+        Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(smooth, scene.camera.fx, distance)),
         Line(
             "pipeline.datamanager.train_num_rays_per_batch", rays, f"keeps {'a GPU' if rays > 1024 else 'caches'} full"
         ),
@@ -165,18 +166,16 @@ def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:
     return camera.bearings(torch.cartesian_prod(torch.from_numpy(columns), torch.from_numpy(rows)))
 
 
-def _stride(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
+def _stride(smooth: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
     """How far apart corrections are learned: as far as the motion between is straight to a quarter of a pixel."""
-    smooth = smoothed(trajectory)
-    distance = _distance(scene, trajectory)[0] if scene.bounds is not None else None
-    keyframes = len(trajectory.t_us)
+    keyframes = len(smooth.t_us)
     stride, off_px = 1, 0.0
     while 2 * stride * 4 <= keyframes:
-        wider = _off_straight_px(smooth, 2 * stride, scene.camera.fx, distance)
+        wider = _off_straight_px(smooth, 2 * stride, focal_px, distance)
         if wider > _STRAIGHT_PX:
             break
         stride, off_px = 2 * stride, wider
-    rate = (keyframes - 1) / (float(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6)
+    rate = (keyframes - 1) / (float(smooth.t_us[-1] - smooth.t_us[0]) * 1e-6)
     if keyframes < 8:
         return 1, f"there are but {keyframes} keyframes"
     if stride == 1:
@@ -184,16 +183,15 @@ def _stride(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
     return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
 
 
-def _interpolation(scene: Scene, trajectory: Trajectory) -> tuple[Interpolation, str]:
+def _interpolation(smooth: Trajectory, focal_px: float, distance: float | None) -> tuple[Interpolation, str]:
     """A spline where the motion between keyframes is no straight line, if they are spaced evenly enough for one."""
-    keyframes = len(trajectory.t_us)
-    gaps_us = trajectory.t_us.diff().double()
+    keyframes = len(smooth.t_us)
+    gaps_us = smooth.t_us.diff().double()
     uneven = float(gaps_us.max() / gaps_us.min())
     if keyframes < 5 or uneven > _UNEVEN:
         return "linear", f"{keyframes} keyframes, gaps between them up to {uneven:.3g} times the shortest: no spline"
-    distance = _distance(scene, trajectory)[0] if scene.bounds is not None else None
     # Halving the distance between knots leaves a quarter of what is not straight.
-    off_px = _off_straight_px(smoothed(trajectory), 2, scene.camera.fx, distance) / 4
+    off_px = _off_straight_px(smooth, 2, focal_px, distance) / 4
     if off_px < _AS_GOOD_AS_STRAIGHT_PX:
         return "linear", f"between keyframes the motion is straight to {off_px:.2g} px"
     return "cubic", f"between keyframes the motion is off a straight line by {off_px:.2g} px"

@@ -171,10 +171,10 @@ def joined(pieces: Iterable[Recording]) -> Recording:
     return Recording(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
-def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None = None) -> int:
+def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None = None) -> None:
     """Write the layout that :class:`RecordingFile` reads, with ``/ms_to_idx`` and the first millisecond as offset.
 
-    Takes the events piece by piece, in order of time, and returns their number. Raises :class:`RecordingError`, which
+    Takes the events piece by piece, in order of time. Raises :class:`RecordingError`, which
     names ``source`` where it is given, for no events and for a span beyond 6 days.
     """
     count = offset_us = begun_ms = 0
@@ -204,7 +204,6 @@ def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None
             raise RecordingError(f"{source or path}: no event is left, expected some")
         _append(columns["ms_to_idx"], np.array([count]))
         file["t_offset"] = np.int64(offset_us)
-    return count
 
 
 def _columns(file: h5py.File) -> dict[str, h5py.Dataset]:

@@ -29,12 +29,15 @@ def decode(
     x, y, p = np.empty(count, np.uint16), np.empty(count, np.uint16), np.empty(count, np.uint8)
     t_us = np.empty(count, np.int64)
     place = _times(raw, _HEADER_BYTES, origin_us, t_us)
+    packed = np.empty(count, np.int64)
     if header & 2:
-        place = _rows_columns_polarities(raw, place, x, y, p)
+        place = _packed(raw, place, 4, packed)
+        y[:], x[:], p[:] = packed >> 12 & 2047, packed >> 1 & 2047, packed & 1
     else:
         place = _runs(raw, place, 2, 5, y)
         if header & 1:
-            place = _columns_polarities(raw, place, x, p)
+            place = _packed(raw, place, 2, packed)
+            x[:], p[:] = packed >> 1 & 2047, packed & 1
         else:
             place = _runs(raw, _masked_columns(raw, place, x), 1, 7, p)
     if place < 0:
@@ -122,28 +125,19 @@ def _masked_columns(raw, place, x):
 
 
 @njit(cache=True)
-def _columns_polarities(raw, place, x, p):
-    """Four numbers of 12 bits, column and polarity, in three words of two bytes."""
-    for i in range(0, len(x), 4):
-        if place < 0 or place + 6 > len(raw):
+def _packed(raw, place, size, numbers):
+    """Four numbers in three words of ``size`` bytes: 12 bits each, column and polarity, or 24 bits, with the row."""
+    quarter = 2 * size
+    ones = (1 << quarter) - 1
+    for i in range(0, len(numbers), 4):
+        if place < 0 or place + 3 * size > len(raw):
             return -1
-        a, b, c = _word(raw, place, 2), _word(raw, place + 2, 2), _word(raw, place + 4, 2)
-        place += 6
-        four = (a >> 4, a & 15 | b >> 8 << 4, b & 255 | c >> 12 << 8, c & 4095)
-        for k in range(min(4, len(x) - i)):
-            x[i + k], p[i + k] = four[k] >> 1, four[k] & 1
-    return place
-
-
-@njit(cache=True)
-def _rows_columns_polarities(raw, place, x, y, p):
-    """Four numbers of 24 bits, row, column and polarity, in three words of four bytes."""
-    for i in range(0, len(x), 4):
-        if place < 0 or place + 12 > len(raw):
-            return -1
-        a, b, c = _word(raw, place, 4), _word(raw, place + 4, 4), _word(raw, place + 8, 4)
-        place += 12
-        four = (a >> 8, a & 0xFF | b >> 16 << 8, b & 0xFFFF | c >> 24 << 16, c & 0xFFFFFF)
-        for k in range(min(4, len(x) - i)):
-            y[i + k], x[i + k], p[i + k] = four[k] >> 12 & 2047, four[k] >> 1 & 2047, four[k] & 1
+        a, b, c = _word(raw, place, size), _word(raw, place + size, size), _word(raw, place + 2 * size, size)
+        place += 3 * size
+        # The second and third number lie across two words, their lower bits in the earlier one.
+        second = a & ones | b >> 2 * quarter << quarter
+        third = b & (1 << 2 * quarter) - 1 | c >> 3 * quarter << 2 * quarter
+        four = (a >> quarter, second, third, c & (1 << 3 * quarter) - 1)
+        for k in range(min(4, len(numbers) - i)):
+            numbers[i + k] = four[k]
     return place
