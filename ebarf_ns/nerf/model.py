@@ -67,7 +67,7 @@ class EbarfModelConfig(ModelConfig):
     """Points per ray at which the field is asked; None: as planned."""
     coarse_samples: int = 128
     """Points per ray at which the remembered density is looked up for importance sampling."""
-    uniform_share: float = 0.25
+    uniform_share: float = 0.125
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
     most_hidden: float = 0.3
     """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""

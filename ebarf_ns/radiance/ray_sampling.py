@@ -11,7 +11,10 @@ from torch import Tensor, nn
 from ebarf_ns.radiance.field import RadianceField, contract
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int64
+
+_SHARE_OF_SEEN = 0.5
+_IN_ORDER = 16384
 
 
 class Rays(NamedTuple):
@@ -93,12 +96,24 @@ class DensityGrid(nn.Module):
         unit = (index + jitter) / self.cells
         self.density[cell] = torch.maximum(0.7 * self.density[cell], field.density_in_unit_cube(unit))
 
+    @torch.no_grad()
+    def remember(self, point: Float[Tensor, "points 3"], density: Float[Tensor, "points"]) -> None:
+        """Keep up with what rays come across, which is where it matters."""
+        cells, densities = self._cell(point).split(_IN_ORDER), density.to(self.density).split(_IN_ORDER)
+        # Pieces so small that torch writes them in order: of several points in a cell, always the last one counts.
+        for cell, seen in zip(cells, densities, strict=True):
+            self.density[cell] = self.density[cell].lerp(seen, _SHARE_OF_SEEN)
+
     def lookup(self, point: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """The remembered density; for contracted scenes, ``point`` is contracted here."""
+        """The remembered density."""
+        return self.density[self._cell(point)]
+
+    def _cell(self, point: Float[Tensor, "*batch 3"]) -> Int64[Tensor, "*batch"]:
+        """Number of the cell that holds each point; for contracted scenes, points are contracted here."""
         point = contract(point) if self.half_side > 1 else point
         scaled = ((point / self.half_side + 1) * (self.cells / 2)).long().clamp(0, self.cells - 1)
         x, y, z = scaled.unbind(-1)
-        return self.density[x + self.cells * (y + self.cells * z)]
+        return x + self.cells * (y + self.cells * z)
 
 
 def importance_edges(
@@ -136,12 +151,15 @@ def composite(
     rays: Rays,
     edges: Float[Tensor, "rays samples+1"],
     background: Float[Tensor, ""] | float,
+    memory: DensityGrid | None = None,
 ) -> Rendered:
-    """Ask the field at the middle of each interval and sum up (Eq. 4)."""
+    """Ask the field at the middle of each interval, and sum up (Eq. 4); ``memory`` is told the densities."""
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
     point = rays.origin[:, None] + middle[..., None] * rays.direction[:, None]
     direction = rays.direction[:, None].expand_as(point).flatten(0, 1) if field.view_dependent else None
     density, intensity = field(point.flatten(0, 1), direction)
+    if memory:
+        memory.remember(point.detach().flatten(0, 1), density.detach())
     weights = weights_of(density.view_as(middle), edges)
     accumulation = weights.sum(-1)
     return Rendered(

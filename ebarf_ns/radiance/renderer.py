@@ -42,7 +42,7 @@ class Sampling:
     """Where the remembered density is, or everywhere evenly."""
     coarse_samples: int = 128
     """Points per ray at which the remembered density is looked up."""
-    uniform_share: float = 0.25
+    uniform_share: float = 0.125
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
     most_hidden: float = 0.3
     """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
@@ -77,7 +77,8 @@ class Renderer(nn.Module):
         The loss looks at the difference between the two rays of a pair: whatever differs between them but the pose is
         noise in exactly that.
         """
-        return composite(self.field, rays, self.sample_edges(rays, pairs_random), _BACKGROUND)
+        edges = self.sample_edges(rays, pairs_random)
+        return composite(self.field, rays, edges, _BACKGROUND, self.density_grid if pairs_random else None)
 
     @torch.no_grad()
     def sample_edges(self, rays: Rays, pairs_random: torch.Generator | None) -> Float[Tensor, "rays samples+1"]:

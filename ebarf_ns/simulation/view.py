@@ -13,16 +13,19 @@ from scipy.spatial.transform import Rotation
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.simulation.motion import Motion
 
-# One ray through the middle, or rays that lie apart on either axis, so that an edge comes in as many steps.
-_SUBPIXELS = {
-    1: [(0.0, 0.0)],
-    4: [(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)],
-    16: [(x, y) for y in (-0.375, -0.125, 0.125, 0.375) for x in (-0.375, -0.125, 0.125, 0.375)],
-}
 _PROBE_US = 250.0
 _KNOTS_EVERY_US = 50.0
 # Whose rays stay in the cache.
 _PIXELS_AT_ONCE = 16384
+
+
+def _subpixels(across: int) -> list[tuple[float, float]]:
+    """A turned square of rays over a pixel: no two share a column or row, so that every edge comes in as many steps."""
+    turned = [(j * across + across - 1 - i, i * across + j) for i in range(across) for j in range(across)]
+    return [((column + 0.5) / across**2 - 0.5, (row + 0.5) / across**2 - 0.5) for column, row in turned]
+
+
+_SUBPIXELS = {across * across: _subpixels(across) for across in (1, 2, 4)}
 
 
 class Surroundings(Protocol):

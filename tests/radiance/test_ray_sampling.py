@@ -16,6 +16,7 @@ from ebarf_ns.radiance.ray_sampling import (
     resample,
     weights_of,
 )
+from ebarf_ns.radiance.renderer import Renderer, Sampling
 
 
 class Slab(torch.nn.Module):
@@ -107,6 +108,28 @@ def test_density_grid_remembers_where_the_wall_is():
     assert seen[0] > 10 and seen[1] < 1
     grid.reset()
     assert (grid.density == 1).all()
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_density_grid_keeps_up_with_what_rays_come_across(bounded: bool):
+    grid = DensityGrid(16, bounded)
+    point = torch.tensor([[0.9, 0.1, -0.3], [-0.2, 0.5, 0.5], [-0.2, 0.5, 0.5]])
+    for _ in range(10):
+        grid.remember(point, torch.tensor([30.0, 7.0, 0.0]))
+    assert grid.lookup(point[:2]).tolist() == pytest.approx([30, 0], abs=0.1)
+    assert (grid.density != 1).sum() == 2
+
+
+def test_only_rays_of_training_are_remembered():
+    torch.manual_seed(0)
+    field = RadianceField(HashGridShape(4, 2, 4, 32, 10), bounded=True, density_bias=3.0)
+    renderer = Renderer(field, Sampling(samples=8, density_cells=16))
+    rays = Rays(torch.zeros(4, 3), torch.nn.functional.normalize(torch.randn(4, 3), dim=-1))
+    assert renderer.density_grid is not None
+    renderer(rays)
+    assert (renderer.density_grid.density == 1).all()
+    renderer(rays, torch.Generator().manual_seed(0))
+    assert (renderer.density_grid.density > 5).any()
 
 
 def test_density_grid_of_an_unbounded_scene_reaches_everywhere():
