@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
-_MOST_MISSED = 2.0
-_ENOUGH_INTERVALS = 20_000
+_ENOUGH_INTERVALS, _INTERVALS = 20_000, 1_000_000
 _MOST_OVER_USUAL, _ALWAYS_COUNT = 10, 200
 
 
@@ -99,13 +98,13 @@ class PairIndex:
     def refractory_us(self) -> int:
         """How long pixels are blind after an event, as the times between their events tell; 0 where they do not.
 
-        Behind such a time intervals pile up: the one that a thousandth is shorter than is taken for it if a hundredth
-        is shorter than twice that, and half of all are longer still.
+        Behind such a time intervals pile up: the one that a ten-thousandth is shorter than is taken for it if a
+        hundredth is shorter than twice that, and half of all are longer still.
         """
         if self.count(np.array(1)) < _ENOUGH_INTERVALS:
             return 0
-        pairs = self.draw(np.ones(_ENOUGH_INTERVALS, np.int64), np.random.default_rng(0))
-        shortest, short, usual = np.quantile(pairs.t1_us - pairs.t0_us, [0.001, 0.01, 0.5])
+        pairs = self.draw(np.ones(_INTERVALS, np.int64), np.random.default_rng(0))
+        shortest, short, usual = np.quantile(pairs.t1_us - pairs.t0_us, [0.0001, 0.01, 0.5])
         return int(shortest) if short < 2 * shortest < usual else 0
 
     def draw(
@@ -166,7 +165,7 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events, refra
         total[i], count[i] = np.int64(after.running_polarity) - before.running_polarity, steps[i]
         if refractory_us > 0:
             for k in range(last - steps[i] + 1, last):
-                missed = _missed(events[k - 1], events[k], events[k + 1], refractory_us)
+                missed = _missed(events, k, first[pixel[i]], refractory_us)
                 total[i] += missed
                 count[i] += abs(missed)
         variance[i] = steps[i] + (count[i] - steps[i]) ** 2
@@ -174,13 +173,22 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events, refra
 
 
 @njit(cache=True, inline="always")
-def _missed(before, event, after, refractory_us):
-    """Events missed right after one, with their sign: at the mean rate of those around it, none where they differ."""
+def _missed(events, k, first, refractory_us):
+    """Events missed right after event ``k``, with its sign: at the mean rate of those next to it that have its sign.
+
+    At most one: what changes faster has changed when the pixel sees again.
+    """
+    before, event, after = events[k - 1], events[k], events[k + 1]
     polarity = event.running_polarity - before.running_polarity
-    if polarity != after.running_polarity - event.running_polarity:
-        return 0.0
-    seen_us = (after.t_us - before.t_us) / 2 - refractory_us
-    return polarity * refractory_us / max(seen_us, refractory_us / _MOST_MISSED)
+    earlier = before.running_polarity - (events[k - 2].running_polarity if k - 2 >= first else 0)
+    rates = sides = 0.0
+    if earlier == polarity:
+        rates += 1 / max(event.t_us - before.t_us - refractory_us, refractory_us)
+        sides += 1
+    if after.running_polarity - event.running_polarity == polarity:
+        rates += 1 / max(after.t_us - event.t_us - refractory_us, refractory_us)
+        sides += 1
+    return polarity * refractory_us * rates / sides if sides else 0.0
 
 
 def index_pairs(

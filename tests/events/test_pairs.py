@@ -221,11 +221,25 @@ def test_what_a_blind_pixel_missed_is_estimated(steps: int):
     assert np.array_equal(plain.t0_us + 1000, pairs.t0_us)
 
 
-def test_nothing_is_missed_where_brightness_turns():
-    polarity = np.array([1, 1, -1, -1, 1, 1], np.int8)
+@pytest.mark.parametrize(
+    ("polarity", "polarity_sum", "event_count"),
+    [
+        # Blind half of the time: after each event as much is missed as that one says, up or down.
+        ([1, 1, -1, -1, 1, 1], 1, 9),
+        # Brightness that turns at every event says nothing of what comes after.
+        ([1, -1, 1, -1, 1, -1], -1, 5),
+    ],
+)
+def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
+    polarity: list[int], polarity_sum: int, event_count: int
+):
     zeros = np.zeros(6, np.uint16)
-    index = index_of(Recording(zeros, zeros, np.arange(6) * 2000, polarity))
+    index = index_of(Recording(zeros, zeros, np.arange(6) * 2000, np.array(polarity, np.int8)))
     pairs = index.draw(np.array([5]), np.random.default_rng(0), 1000)
-    # Going down, and up again, the pixel is blind half of the time; where it turns, nobody knows.
-    assert pairs.polarity_sum[0] == polarity[1:].sum() - 1 + 1
-    assert (pairs.event_count[0], pairs.variance[0]) == (7, 9)
+    assert (pairs.polarity_sum[0], pairs.event_count[0]) == (polarity_sum, event_count)
+    assert pairs.variance[0] == 5 + (event_count - 5) ** 2
+
+
+def test_no_more_than_an_event_is_missed_at_a_time():
+    pairs = spaced(np.full(10, 1001)).draw(np.array([9]), np.random.default_rng(0), 1000)
+    assert (pairs.polarity_sum[0], pairs.event_count[0]) == (9 + 8, 9 + 8)
