@@ -53,7 +53,9 @@ def _trainer(
 def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConfig:
     """The seed paper's method; its baseline is the same with the poses frozen."""
     model = EbarfModelConfig(
-        camera_optimizer=TrajectoryOptimizerConfig(mode=mode, smooth=False, keyframe_stride=1, interpolation="linear"),
+        camera_optimizer=TrajectoryOptimizerConfig(
+            mode=mode, smooth=False, keyframe_stride=1, prior=0.0, interpolation="linear"
+        ),
         loss="normalized",
         outliers_from=None,
         brightness="lin_log",

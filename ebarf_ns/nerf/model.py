@@ -69,7 +69,7 @@ class EbarfModelConfig(ModelConfig):
     """Points per ray at which the remembered density is looked up for importance sampling."""
     uniform_share: float = 0.125
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
-    most_hidden: float = 0.3
+    most_hidden: float = 0.15
     """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
     density_cells: int | None = None
     """Cells per side of the remembered density; None: as planned."""
@@ -181,9 +181,13 @@ class EbarfModel(Model):
         change = after - before
         reported = reported_change(batch["polarity_sum"], batch["event_count"], *self.thresholds).to(change)
         if self.normalized:
-            return {"event_loss": normalized_loss(change, reported)}
-        variance, threshold = batch["variance"].to(change), sum(self.thresholds) / 2
-        return {"event_loss": threshold_loss(change, reported, variance, threshold, self.config.outliers_from)}
+            loss = normalized_loss(change, reported)
+        else:
+            variance, threshold = batch["variance"].to(change), sum(self.thresholds) / 2
+            loss = threshold_loss(change, reported, variance, threshold, self.config.outliers_from)
+        losses = {"event_loss": loss}
+        self.camera_optimizer.get_loss_dict(losses)
+        return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """How opaque the scene is, and how far the keyframes have moved."""

@@ -15,6 +15,8 @@ from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate, intervals
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
 
+_GOOD_PX = 0.1
+
 
 @dataclass
 class TrajectoryOptimizerConfig(CameraOptimizerConfig):
@@ -27,6 +29,8 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
+    prior: float = 0.005
+    """How much the trajectory as it came counts beside the events, all of which count as 1; 0: not at all."""
     interpolation: Interpolation | None = None
     """Between keyframes: straight and at constant velocity (Eq. 3), or with velocities that run on through the
     keyframes; None: as planned."""
@@ -135,7 +139,15 @@ class TrajectoryOptimizer(CameraOptimizer):
         return opengl_from_opencv(moved).to(camera_to_world)
 
     def get_loss_dict(self, loss_dict: dict) -> None:
-        """No penalty: the gauge is free while training."""
+        """Adds what speaks for the trajectory as it came: it is off by some pixels, but nobody knows by how many.
+
+        If that number may be of any size, from a tenth of a pixel on, corrections c cost log(1 + mean |c|² / 0.1²):
+        large ones next to nothing, while a good trajectory stays where a field that is yet to take shape would bend
+        it. The events' own loss says how noisy they are, and scales it.
+        """
+        if self.config.mode == "refine" and self.config.prior:
+            size = torch.log1p(self.correction.square().sum(dim=-1).mean() / _GOOD_PX**2)
+            loss_dict["trajectory_prior"] = self.config.prior * loss_dict["event_loss"].detach() * size
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
         """Mean size of the corrections, in pixels."""

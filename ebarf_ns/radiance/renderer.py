@@ -44,7 +44,7 @@ class Sampling:
     """Points per ray at which the remembered density is looked up."""
     uniform_share: float = 0.125
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
-    most_hidden: float = 0.3
+    most_hidden: float = 0.15
     """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
     density_cells: int = 96
     """Cells per side of the remembered density."""

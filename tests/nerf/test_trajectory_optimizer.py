@@ -42,6 +42,28 @@ def test_untouched_corrections_are_plain_zeros_and_change_nothing():
     assert type(fresh(torch.arange(COUNT))) is torch.Tensor
 
 
+def test_small_corrections_cost_and_large_ones_hardly_cost_more():
+    made, slopes = optimizer(), []
+    for size_px in (0.0, 0.05, 5.0, 50.0):
+        with torch.no_grad():
+            made.correction.fill_(size_px / 6**0.5)
+        losses = {"event_loss": torch.tensor(0.2, requires_grad=True)}
+        made.get_loss_dict(losses)
+        slope, of_events = torch.autograd.grad(
+            losses["trajectory_prior"], [made.correction, losses["event_loss"]], allow_unused=True
+        )
+        slopes.append(float(slope.norm()))
+        assert of_events is None
+    assert slopes[0] == 0 and slopes[1] > 20 * slopes[2] > 150 * slopes[3] > 0
+
+
+@pytest.mark.parametrize("options", [{"prior": 0.0}, {"mode": "off"}])
+def test_no_prior_is_no_loss(options: dict):
+    losses = {"event_loss": torch.tensor(0.2)}
+    optimizer(**options).get_loss_dict(losses)
+    assert list(losses) == ["event_loss"]
+
+
 def test_viewer_and_exporter_see_the_same_refined_keyframes():
     """The viewer multiplies by forward() on the right, ns-export cameras calls apply_to_camera()."""
     refined = optimizer()
