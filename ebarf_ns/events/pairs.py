@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
-_ENOUGH_INTERVALS, _INTERVALS = 20_000, 1_000_000
+_ENOUGH_INTERVALS, _INTERVALS = 20_000, 200_000
 _MOST_OVER_USUAL, _ALWAYS_COUNT = 10, 200
 
 

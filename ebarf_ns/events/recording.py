@@ -174,8 +174,8 @@ def joined(pieces: Iterable[Recording]) -> Recording:
 def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None = None) -> None:
     """Write the layout that :class:`RecordingFile` reads, with ``/ms_to_idx`` and the first millisecond as offset.
 
-    Takes the events piece by piece, in order of time. Raises :class:`RecordingError`, which
-    names ``source`` where it is given, for no events and for a span beyond 6 days.
+    Takes the events piece by piece, in order of time. Raises :class:`RecordingError`, which names ``source`` where it
+    is given, for no events and for a span beyond 6 days.
     """
     count = offset_us = begun_ms = 0
     columns: dict[str, h5py.Dataset] = {}

@@ -65,15 +65,15 @@ class EbarfModelConfig(ModelConfig):
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
     samples: int | None = None
     """Points per ray at which the field is asked; None: as planned."""
-    coarse_samples: int = 128
+    coarse_samples: int = Sampling.coarse_samples
     """Points per ray at which the remembered density is looked up for importance sampling."""
-    uniform_share: float = 0.125
+    uniform_share: float = Sampling.uniform_share
     """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
-    most_hidden: float = 0.15
+    most_hidden: float = Sampling.most_hidden
     """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
     density_cells: int | None = None
     """Cells per side of the remembered density; None: as planned."""
-    near: float = 0.05
+    near: float = Sampling.near
     """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
     density_bias: float = 0.0
     """Log density at the start of training."""

@@ -68,7 +68,7 @@ def _times(raw, place, now_us, t_us):
         if run == 15:
             if place + 2 > len(raw):
                 return -1
-            run, place = raw[place] | np.int64(raw[place + 1]) << 8, place + 2
+            run, place = _word(raw, place, 2), place + 2
         if not 0 < run <= len(t_us) - i:
             return -1
         now_us += step
