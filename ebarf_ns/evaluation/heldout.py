@@ -1,40 +1,41 @@
 """How well a render predicts the events that it was not trained on."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import nnls
 
 
-def unexplained_share(
-    change: Float[np.ndarray, "pairs"], reported: Float[np.ndarray, "pairs"], variance: Float[np.ndarray, "pairs"]
-) -> float:
-    """Share of the reported brightness changes that the rendered ones leave unexplained: 0 is perfect, 1 is nothing.
+class Prediction(NamedTuple):
+    """How a render and the events of some pairs go together."""
 
-    min over a of sum w (r - a c)² / sum w r², w = 1 / variance (of a pair, its number of events): one gain is fitted,
-    since events leave the scale of log brightness open where the threshold is unknown, so that the number compares
-    methods and sensors.
-    """
-    weight = 1 / variance
-    total = float((weight * reported**2).sum())
-    if total == 0:
-        return float("nan")
-    energy = float((weight * change**2).sum())
-    shared = float((weight * change * reported).sum())
-    # A render that moves against the events explains nothing of them.
-    return 1 - max(shared, 0.0) ** 2 / (energy * total) if energy > 0 else 1.0
+    unexplained: float
+    """Share of one that the other leaves unexplained: 0 is perfect, 1 is nothing, NaN where nothing was reported."""
+    threshold_on: float | None
+    """The contrast threshold, in log brightness, by which the events say what the render shows; None where the pairs
+    cannot tell on and off apart."""
+    threshold_off: float | None
 
 
-def implied_thresholds(
+def prediction(
     change: Float[np.ndarray, "pairs"],
     polarity_sum: Float[np.ndarray, "pairs"],
     event_count: Float[np.ndarray, "pairs"],
-) -> tuple[float | None, float | None]:
-    """The contrast thresholds, on and off, in log brightness, by which the events say what the render shows.
+    variance: Float[np.ndarray, "pairs"],
+) -> Prediction:
+    """min over on, off >= 0 of sum w (c - r)² / sum w c², w = 1 / variance, r = on * brighter - off * darker events.
 
-    Least squares of change ~ on * (brighter events) - off * (darker events), each pair weighted by one over its
-    events. None for both where the pairs cannot tell them apart.
+    Both thresholds are fitted, since events leave their scale open and nominal ones are seldom those in force, so that
+    the number compares methods and sensors. c are the rendered changes of log brightness.
     """
-    weight = 1 / np.sqrt(event_count)
+    weight = 1 / np.sqrt(variance)
     brighter = (event_count + polarity_sum) / 2
     counts = np.stack([brighter, brighter - event_count], axis=1) * weight[:, None]
-    (on, off), _, rank, _ = np.linalg.lstsq(counts, change * weight, rcond=1e-6)
-    return (float(on), float(off)) if rank == 2 else (None, None)
+    energy = float(((change * weight) ** 2).sum())
+    if not polarity_sum.any():
+        return Prediction(float("nan"), None, None)
+    (on, off), left = nnls(counts, change * weight)
+    apart = np.linalg.matrix_rank(counts, tol=1e-6 * np.linalg.norm(counts)) == 2
+    # A render that shows no change, or moves against the events, explains nothing of them.
+    return Prediction(left**2 / energy if energy else 1.0, *((float(on), float(off)) if apart else (None, None)))

@@ -15,6 +15,7 @@ from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss
+from ebarf_ns.photometry.sensor_response import SensorResponse
 from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
 from ebarf_ns.radiance.hash_grid import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
@@ -43,6 +44,8 @@ class EbarfModelConfig(ModelConfig):
     """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; None: as planned."""
     outliers_from: float | None = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
+    learn_sensor: bool = True
+    """Learn the ratio of the contrast thresholds and how fast pixels leak, or take the thresholds as given."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -97,7 +100,10 @@ class EbarfModel(Model):
             raise TrainingError(f"{path}: no contrast_threshold, which --pipeline.model.loss threshold needs")
         self.normalized = config.loss == "normalized"
         # Without thresholds, polarities are compared in units of one common threshold.
-        self.thresholds = (threshold.on, threshold.off) if threshold and not self.normalized else (1.0, 1.0)
+        on, off = (threshold.on, threshold.off) if threshold and not self.normalized else (1.0, 1.0)
+        # Without the thresholds' scale, a loss can be had for nothing by letting one of them vanish.
+        self.sensor = SensorResponse(on, off, config.learn_sensor and not self.normalized)
+        self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
             levels=_planned(config.grid_levels),
             features=config.grid_features,
@@ -134,8 +140,8 @@ class EbarfModel(Model):
         self.random = torch.Generator()
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """Two groups: fields, and camera_opt for the keyframe corrections."""
-        groups = {"fields": list(self.renderer.parameters())}
+        """Two groups: fields, with what is learned of the sensor, and camera_opt for the keyframe corrections."""
+        groups = {"fields": [*self.renderer.parameters(), *self.sensor.parameters()]}
         self.camera_optimizer.get_param_groups(groups)
         return groups
 
@@ -157,8 +163,9 @@ class EbarfModel(Model):
         """Forget the field and keep the poses."""
         self.renderer.reset()
 
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Rendered intensity, depth and accumulation, and a grey picture of the log brightness for people."""
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, and what the
+        sensor is taken to be."""
         self.camera_optimizer.apply_to_raybundle(ray_bundle)
         rays = Rays(ray_bundle.origins, ray_bundle.directions)
         rendered = self.renderer(rays, self.random if self.training else None)
@@ -173,25 +180,31 @@ class EbarfModel(Model):
             "brightness": brightness[:, None],
             "depth": rendered.depth[:, None],
             "accumulation": rendered.accumulation[:, None],
+            # Training in several processes asks that what is learned takes part in this.
+            "sensor": self.sensor(),
         }
 
-    def get_loss_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor], metrics_dict: Any = None) -> dict:
+    def get_loss_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None) -> dict:
         """The change of log brightness between the two rays of each pair, against what its events report."""
         before, after = outputs["brightness"][:, 0].chunk(2)
         change = after - before
-        reported = reported_change(batch["polarity_sum"], batch["event_count"], *self.thresholds).to(change)
+        on, off, leak_hz = outputs["sensor"]
+        leaked = 1e-6 * leak_hz * batch["duration_us"]
+        reported = reported_change(batch["polarity_sum"], batch["event_count"], on, off, leaked).to(change)
         if self.normalized:
             loss = normalized_loss(change, reported)
         else:
-            variance, threshold = batch["variance"].to(change), sum(self.thresholds) / 2
-            loss = threshold_loss(change, reported, variance, threshold, self.config.outliers_from)
+            variance = batch["variance"].to(change)
+            loss = threshold_loss(change, reported, variance, self.mean_threshold, self.config.outliers_from)
         losses = {"event_loss": loss}
         self.camera_optimizer.get_loss_dict(losses)
         return losses
 
-    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """How opaque the scene is, and how far the keyframes have moved."""
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """How opaque the scene is, what the sensor is taken to be, and how far the keyframes have moved."""
         metrics = {"accumulation": outputs["accumulation"].detach().mean()}
+        if self.sensor.learned:
+            metrics |= {name: number.detach() for name, number in outputs["sensor"]._asdict().items()}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError, one_line_errors
 from ebarf_ns.evaluation.frames import depth_error, fit_brightness, image_errors, read_depth, read_frame
-from ebarf_ns.evaluation.heldout import implied_thresholds, unexplained_share
+from ebarf_ns.evaluation.heldout import prediction
 from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world, trajectory_results
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
@@ -22,7 +22,6 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras
 from ebarf_ns.nerf.model import EbarfModel
-from ebarf_ns.photometry.event_loss import reported_change
 from ebarf_ns.scene import Frame, Scene
 
 # nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
@@ -102,16 +101,12 @@ class EbarfPipeline(VanillaPipeline):
             return {"heldout_event_loss": None}
         rays, batch = self.datamanager.next_eval(0)
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)
-        polarity_sum, event_count = batch["polarity_sum"].cpu(), batch["event_count"].cpu()
-        threshold = self.scene.contrast_threshold
-        on, off = (threshold.on, threshold.off) if threshold else (1.0, 1.0)
-        reported = reported_change(polarity_sum, event_count, on, off).double()
-        change, counts = (after - before).numpy(), event_count.double().numpy()
-        implied = implied_thresholds(change, polarity_sum.double().numpy(), counts)
+        columns = (batch[name].double().cpu().numpy() for name in ("polarity_sum", "event_count", "variance"))
+        predicted = prediction((after - before).numpy(), *columns)
         return {
-            "heldout_event_loss": unexplained_share(change, reported.numpy(), batch["variance"].cpu().numpy()),
-            "implied_threshold_on": implied[0],
-            "implied_threshold_off": implied[1],
+            "heldout_event_loss": predicted.unexplained,
+            "implied_threshold_on": predicted.threshold_on,
+            "implied_threshold_off": predicted.threshold_off,
         }
 
     def _image_errors(self, renders: Path | None, scale_to_reference: float | None) -> dict[str, float | None]:

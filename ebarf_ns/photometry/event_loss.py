@@ -14,12 +14,16 @@ if TYPE_CHECKING:
 def reported_change(
     polarity_sum: Float[Tensor, "pairs"],
     event_count: Float[Tensor, "pairs"],
-    threshold_on: float,
-    threshold_off: float,
+    threshold_on: Tensor | float,
+    threshold_off: Tensor | float,
+    leaked: Float[Tensor, "pairs"] | float = 0.0,
 ) -> Float[Tensor, "pairs"]:
-    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one."""
+    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one.
+
+    Of the brighter ones, ``leaked`` many report nothing.
+    """
     brighter = (event_count + polarity_sum) / 2
-    return brighter * threshold_on - (event_count - brighter) * threshold_off
+    return (brighter - leaked) * threshold_on - (event_count - brighter) * threshold_off
 
 
 def threshold_loss(

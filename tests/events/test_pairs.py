@@ -237,7 +237,7 @@ def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
     index = index_of(Recording(zeros, zeros, np.arange(6) * 2000, np.array(polarity, np.int8)))
     pairs = index.draw(np.array([5]), np.random.default_rng(0), 1000)
     assert (pairs.polarity_sum[0], pairs.event_count[0]) == (polarity_sum, event_count)
-    assert pairs.variance[0] == 5 + (event_count - 5) ** 2
+    assert pairs.variance[0] == 5 + 8 * (event_count - 5)
 
 
 def test_no_more_than_an_event_is_missed_at_a_time():

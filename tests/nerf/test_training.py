@@ -72,6 +72,18 @@ def test_each_method_leaves_trajectories_metrics_and_report(tiny_scene: Path, tm
     assert (run / "report" / "report.html").stat().st_size > 10_000
 
 
+def test_wrong_ratio_of_the_thresholds_is_corrected(tiny_scene: Path, tmp_path: Path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    text = json.loads((scene / "scene.json").read_text())
+    assert text["contrast_threshold"]["on"] == text["contrast_threshold"]["off"]
+    text["contrast_threshold"]["on"] *= 1.5
+    (scene / "scene.json").write_text(json.dumps(text))
+    ready = trainer(config(scene, tmp_path, steps=100))
+    ready.train()
+    on, off, _ = ready.pipeline.model.sensor()
+    assert float(on / off) == pytest.approx(1, abs=0.1)
+
+
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     lines = (scene / "trajectory.txt").read_text().splitlines()
