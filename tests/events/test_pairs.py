@@ -240,6 +240,6 @@ def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
     assert pairs.variance[0] == 5 + 8 * (event_count - 5)
 
 
-def test_no_more_than_an_event_is_missed_at_a_time():
+def test_no_more_than_three_events_are_missed_at_a_time():
     pairs = spaced(np.full(10, 1001)).draw(np.array([9]), np.random.default_rng(0), 1000)
-    assert (pairs.polarity_sum[0], pairs.event_count[0]) == (9 + 8, 9 + 8)
+    assert (pairs.polarity_sum[0], pairs.event_count[0]) == pytest.approx((9 + 3 * 8, 9 + 3 * 8))
