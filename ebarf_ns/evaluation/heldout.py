@@ -29,13 +29,13 @@ def prediction(
     Both thresholds are fitted, since events leave their scale open and nominal ones are seldom those in force, so that
     the number compares methods and sensors. c are the rendered changes of log brightness.
     """
+    if not polarity_sum.any():
+        return Prediction(float("nan"), None, None)
     weight = 1 / np.sqrt(variance)
     brighter = (event_count + polarity_sum) / 2
     counts = np.stack([brighter, brighter - event_count], axis=1) * weight[:, None]
-    energy = float(((change * weight) ** 2).sum())
-    if not polarity_sum.any():
-        return Prediction(float("nan"), None, None)
     (on, off), left = nnls(counts, change * weight)
     apart = np.linalg.matrix_rank(counts, tol=1e-6 * np.linalg.norm(counts)) == 2
     # A render that shows no change, or moves against the events, explains nothing of them.
-    return Prediction(left**2 / energy if energy else 1.0, *((float(on), float(off)) if apart else (None, None)))
+    unexplained = float(left / np.linalg.norm(change * weight)) ** 2 if on or off else 1.0
+    return Prediction(unexplained, *((float(on), float(off)) if apart else (None, None)))

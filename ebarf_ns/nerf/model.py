@@ -45,7 +45,7 @@ class EbarfModelConfig(ModelConfig):
     outliers_from: float | None = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     learn_sensor: bool = True
-    """Learn the ratio of the contrast thresholds and how fast pixels leak, or take the thresholds as given."""
+    """With Eq. 5: learn the ratio of the contrast thresholds and how fast pixels leak, or take them as given."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"

@@ -21,8 +21,13 @@ def test_perfect_render_leaves_nothing_whatever_its_scale_and_tells_the_threshol
 
 def test_ignorant_contrary_or_dark_render_leaves_everything():
     assert predicted(RANDOM.standard_normal(5000)).unexplained > 0.99
-    assert predicted(-TRUE_CHANGE).unexplained > 0.99
+    assert predicted(0.25 * (DARKER - BRIGHTER)).unexplained == 1
     assert predicted(np.zeros(5000)).unexplained == 1
+
+
+def test_thresholds_are_found_beneath_noise():
+    _, on, off = predicted(TRUE_CHANGE + 0.01 * RANDOM.standard_normal(5000))
+    assert on == pytest.approx(0.21, rel=0.02) and off == pytest.approx(0.34, rel=0.02)
 
 
 def test_half_right_is_in_between():
@@ -36,3 +41,4 @@ def test_nothing_reported_is_no_number():
 
 def test_thresholds_that_the_pairs_cannot_tell_apart_are_none():
     assert prediction(np.ones(5), np.ones(5), np.ones(5), np.ones(5)) == (pytest.approx(0), None, None)
+    assert prediction(np.array([0.3]), np.zeros(1), np.full(1, 2.0), np.full(1, 2.0))[1:] == (None, None)
