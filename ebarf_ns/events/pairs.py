@@ -107,13 +107,13 @@ class PairIndex:
         """How long pixels are blind after an event, as the times between their events tell; 0 where they do not.
 
         Behind such a time intervals pile up: the one that a ten-thousandth is shorter than is taken for it if a
-        hundredth is shorter than twice that, and half of all are longer still.
+        thousandth is shorter than one and a half times that, and half of all are longer than twice that.
         """
         if self.count(np.array(1)) < _ENOUGH_INTERVALS:
             return 0
         pairs = self.draw(np.ones(_INTERVALS, np.int64), np.random.default_rng(0))
-        shortest, short, usual = np.quantile(pairs.t1_us - pairs.t0_us, [0.0001, 0.01, 0.5])
-        return int(shortest) if short < 2 * shortest < usual else 0
+        shortest, short, usual = np.quantile(pairs.duration_us, [0.0001, 0.001, 0.5])
+        return int(shortest) if short < 1.5 * shortest and 2 * shortest < usual else 0
 
     def draw(
         self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator, refractory_us: int = 0

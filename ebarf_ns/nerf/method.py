@@ -58,6 +58,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         ),
         loss="normalized",
         outliers_from=None,
+        render_variance=0.0,
         learn_sensor=False,
         brightness="lin_log",
         intensity_range="unit",

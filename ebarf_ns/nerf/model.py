@@ -44,6 +44,8 @@ class EbarfModelConfig(ModelConfig):
     """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; None: as planned."""
     outliers_from: float | None = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
+    render_variance: float = 5.0
+    """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
     learn_sensor: bool = True
     """With Eq. 5: learn the ratio of the contrast thresholds and how fast pixels leak, or take them as given."""
     brightness: BrightnessKind = "log"
@@ -194,8 +196,14 @@ class EbarfModel(Model):
         if self.normalized:
             loss = normalized_loss(change, reported)
         else:
-            variance = batch["variance"].to(change)
-            loss = threshold_loss(change, reported, variance, self.mean_threshold, self.config.outliers_from)
+            loss = threshold_loss(
+                change,
+                reported,
+                batch["variance"].to(change),
+                self.mean_threshold,
+                self.config.outliers_from,
+                self.config.render_variance,
+            )
         losses = {"event_loss": loss}
         self.camera_optimizer.get_loss_dict(losses)
         return losses

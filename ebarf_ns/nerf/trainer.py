@@ -43,6 +43,7 @@ _LEAST = {
     "pipeline.model.grid_coarsest": 2,
     "pipeline.model.most_hidden": 1e-6,
     "pipeline.model.outliers_from": 1e-3,
+    "pipeline.model.render_variance": 0,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
 }

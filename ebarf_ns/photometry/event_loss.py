@@ -32,14 +32,18 @@ def threshold_loss(
     variance: Float[Tensor, "pairs"],
     threshold: float,
     outliers_from: float | None = None,
+    render_variance: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Eq. 5 in units of the threshold, each pair weighted by one over its variance in that unit; 0 for no pairs.
+    """Eq. 5 in units of the threshold, each pair weighted by one over its variance, for one event 1; 0 for no pairs.
 
-    The errors of the single thresholds add up over the events of a pair, so its variance grows with their number.
-    Errors beyond ``outliers_from`` standard deviations count by their size, no longer by its square (Huber 1964): what
-    a render gets wrong at silhouettes must not bend the trajectory.
+    The errors of the single thresholds add up over the events of a pair, so its variance grows with their number. To
+    that comes ``render_variance``, in variances of one event: what renders are wrong by however many events there are.
+    So long pairs, which tell brightness at large, weigh little less than short ones. Errors beyond ``outliers_from``
+    standard deviations count by their size, no longer by its square (Huber 1964): what a render gets wrong at
+    silhouettes must not bend the trajectory.
     """
-    error = (change - reported) / (threshold * variance.sqrt())
+    deviations = ((render_variance + variance) / (render_variance + 1)).sqrt()
+    error = (change - reported) / (threshold * deviations)
     if outliers_from is None:
         cost = error * error
     else:

@@ -204,6 +204,13 @@ def test_how_long_pixels_are_blind_is_seen_where_intervals_pile_up(blind_us: int
     assert found == pytest.approx(expected, rel=0.05, abs=2)
 
 
+def test_blind_times_are_seen_where_few_events_follow_soon():
+    # Their number rises only slowly with the time since: a hundredth come sooner than 2.3 ms.
+    random = np.random.default_rng(0)
+    assert spaced(1000 + random.gamma(2, 9000, 40_000)).refractory_us == pytest.approx(1000, rel=0.15)
+    assert spaced(random.gamma(2, 9000, 40_000)).refractory_us == 0
+
+
 def test_few_intervals_say_nothing_of_blind_times():
     assert spaced(np.full(500, 1000)).refractory_us == 0
 

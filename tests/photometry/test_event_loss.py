@@ -27,6 +27,13 @@ def test_threshold_loss_is_equation_five_in_thresholds():
     assert float(longer) == pytest.approx(float(loss) / 4)
 
 
+def test_what_renders_are_wrong_by_makes_long_pairs_weigh_little_less_than_short_ones():
+    change, reported = torch.tensor([0.5]), torch.tensor([0.25])
+    of_one, of_four = (threshold_loss(change, reported, torch.tensor([n]), 0.25, render_variance=5.0) for n in (1, 4))
+    assert float(of_one) == pytest.approx(1.0)
+    assert float(of_four) == pytest.approx(6 / 9)
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_normalized_loss_does_not_know_the_threshold(factor: float):
     change, reported, _ = batch(64)
