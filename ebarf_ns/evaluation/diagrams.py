@@ -21,6 +21,7 @@ from matplotlib.ticker import NullFormatter
 from ebarf_ns.files import whole_file
 
 Record = dict[str, Any]
+Panels = dict[tuple[str, str], list[Record]]
 
 _ERRORS = {
     "ate_m": "position error [m]",
@@ -29,6 +30,7 @@ _ERRORS = {
     "heldout_event_loss": "unexplained events",
 }
 _POSE_ERRORS = ("ate_m", "rotation_deg")
+_AS_GOOD_AS_NOTHING = 1e-7
 _STYLES = {"method": "-", "floor": "--", "ceiling": ":"}
 _TOLERANCES = (0.1, 0.01, 0.001)
 _PSNR_TARGETS = (20.0, 22.0, 24.0, 26.0, 28.0)
@@ -100,7 +102,7 @@ def _problems(records: Sequence[Record], *keys: str) -> dict[tuple, list[Record]
     return groups
 
 
-def _panels(records: Sequence[Record], roles: dict[str, str]) -> dict[tuple[str, str], list[Record]]:
+def _panels(records: Sequence[Record], roles: dict[str, str]) -> Panels:
     """The records of each scene and trajectory; floors go into all panels of their scene."""
     floors = [record for record in records if roles.get(record["method"]) == "floor"]
     others = [record for record in records if roles.get(record["method"]) != "floor"]
@@ -210,26 +212,72 @@ def _target(group: Sequence[Record], name: str, tolerance: float) -> float:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """How good after each time, and how long to each target, medians over the seeds, as Markdown."""
+    """How good after each time, each seed against others, and how long to each target, as Markdown."""
     panels = _panels(result["records"], result["roles"])
-    lines = [f"{result['machine']}, {result['date']}; medians over the seeds", ""]
-    lines += _row("scene", "trajectory", "method", "time", "PSNR", "position error", "rotation error", "unexplained")
-    lines += ["|---" * 8 + "|"]
+    failed = [record for record in result["records"] if record.get("error")]
+    count = f"{len(failed)} training{'s' if len(failed) > 1 else ''}" if failed else "No training"
+    lines = [
+        f"{result['machine']}, {result['date']}; medians over the seeds",
+        *("", *_ends(panels)),
+        *("", "Seed by seed against others, medians [quartiles]:"),
+        *("", *_against_others(panels, result["roles"])),
+        *("", "Seconds of training until reached:"),
+        *("", *_seconds_until(panels)),
+        *("", f"{count} failed."),
+        *(f"- {record['method']}, {record['scene']}, seed {record['seed']}: {record['error']}" for record in failed),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _ends(panels: Panels) -> list[str]:
+    lines = _head("scene", "trajectory", "method", "time", "PSNR", "position error", "rotation error", "unexplained")
     for (scene, trajectory), group in panels.items():
         initial = [record["initial"] for record in group if record["trajectory"] == trajectory]
         given = (_shown(_median(initial, name), unit) for name, unit in (("ate_m", "m"), ("rotation_deg", "deg")))
         lines += _row(scene, trajectory, "as given", "", "", *given, "")
         for (method, seconds), own in _problems(group, "method", "seconds").items():
             last = [_last(record) for record in own]
-            psnr = float(np.median([-math.inf if one.get("psnr") is None else one["psnr"] for one in last]))
+            psnr = float(np.median([_psnr(one) for one in last]))
             errors = (_shown(_median(last, name), unit) for name, unit in (("ate_m", "m"), ("rotation_deg", "deg")))
             unexplained = _shown(_median(last, "heldout_event_loss"), "")
             lines += _row(scene, trajectory, method, f"{seconds:g} s", _shown(psnr, "dB"), *errors, unexplained)
+    return lines
+
+
+def _against_others(panels: Panels, roles: dict[str, str]) -> list[str]:
+    """What each training has over that of the same scene, trajectory, seed and time by the first method, and by the
+    floor, and which part of the trajectory's errors it left."""
+    first = next((method for method, role in roles.items() if role == "method"), "")
+    floor = next((method for method, role in roles.items() if role == "floor"), "")
+    lines = _head(
+        *("scene", "trajectory", "method", "time", f"PSNR over {first}", "PSNR over the floor"),
+        *("position error left", "rotation error left", f"time a step over {first}"),
+    )
+    for (scene, trajectory), group in panels.items():
+        trainings = {tuple(record[key] for key in ("method", "seed", "seconds")): record for record in group}
+        for (method, seconds), own in _problems(group, "method", "seconds").items():
+            columns = []
+            for record in own:
+                end, initial = _last(record), record["initial"]
+                by_first, by_floor = (
+                    _last(trainings.get((other, record["seed"], seconds), {"evaluations": []}))
+                    for other in (first, floor)
+                )
+                left = (_ratio(error_of(end, name), error_of(initial, name)) for name in _POSE_ERRORS)
+                gains = (_psnr(end) - _psnr(by_first), _psnr(end) - _psnr(by_floor))
+                columns.append([*gains, *left, _ratio(_seconds_a_step(end), _seconds_a_step(by_first))])
+            own_column, *rest = (_spread(values) for values in zip(*columns, strict=True))
+            *rest, pace = rest
+            if method == first:
+                own_column = pace = "-"
+            lines += _row(scene, trajectory, method, f"{seconds:g} s", own_column, *rest, pace)
+    return lines
+
+
+def _seconds_until(panels: Panels) -> list[str]:
     targets = [("image", 10 ** (-psnr / 20), f"{psnr:g} dB") for psnr in _PSNR_TARGETS]
     targets += [("ate_m", metres, f"{100 * metres:g} cm") for metres in _POSITION_TARGETS_M]
-    lines += ["", "Seconds of training until reached:", ""]
-    lines += _row("scene", "trajectory", "method", *(title for _, _, title in targets))
-    lines += ["|---" * (3 + len(targets)) + "|"]
+    lines = _head("scene", "trajectory", "method", *(title for _, _, title in targets))
     for (scene, trajectory), group in panels.items():
         for (method,), own in _problems(group, "method").items():
             cells = []
@@ -238,11 +286,33 @@ def tables(result: dict[str, Any]) -> str:
                 middle = float(np.median(times))
                 cells.append(f"{middle:.0f}" if math.isfinite(middle) else "not reached")
             lines += _row(scene, trajectory, method, *cells)
-    failed = [record for record in result["records"] if record.get("error")]
-    count = f"{len(failed)} training{'s' if len(failed) > 1 else ''}" if failed else "No training"
-    lines += ["", f"{count} failed."]
-    lines += [f"- {record['method']}, {record['scene']}, seed {record['seed']}: {record['error']}" for record in failed]
-    return "\n".join(lines) + "\n"
+    return lines
+
+
+def _psnr(evaluation: Record) -> float:
+    psnr = evaluation.get("psnr")
+    return -math.inf if psnr is None else psnr
+
+
+def _seconds_a_step(evaluation: Record) -> float:
+    return _ratio(evaluation.get("train_seconds", math.nan), evaluation.get("step", 0))
+
+
+def _ratio(error: float, other: float) -> float:
+    """Unknown where the other one is as good as nothing, as errors of true poses are."""
+    return error / other if other > _AS_GOOD_AS_NOTHING else math.nan
+
+
+def _spread(values: Sequence[float]) -> str:
+    """Median and quartiles, of what is known of all."""
+    if not np.isfinite(values).all():
+        return "-"
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _head(*titles: str) -> list[str]:
+    return [*_row(*titles), "|---" * len(titles) + "|"]
 
 
 def _row(*cells: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Adam that knows that the six numbers of a keyframe belong together."""
+"""Adam that knows that the six numbers of a keyframe belong together, and that neighbours move together."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,19 +8,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 _ROOTS_A_STEP = 256
+_FEW = 4
 
 
 class KeyframeAdam(torch.optim.Optimizer):
-    """Adam whose second moment is a matrix for each row of its parameters.
+    """Adam whose second moment is a matrix for each row of its parameters, and for each stretch of rows.
 
     A small rotation looks much like a shift: events tell their sum well, and their difference badly. Adam scales each
     number by itself, so that the noise of the sum sets the pace of the difference too. Here the mean gradient of a row
     is multiplied by C^(-1/2), C the running mean of its gradients' outer products (full-matrix AdaGrad, Duchi et al.
-    2011, with Adam's forgetting): each direction goes by its own noise. For rows of one number this is Adam.
+    2011, with Adam's forgetting): each direction goes by its own noise.
 
-    ``eps`` is the share of a row's mean second moment that is added to each direction's. Inverse roots are computed
-    anew for no more than 256 rows a step, in turn; a row stays where it is until its first. Not ``coupled``, it scales
-    each number by itself.
+    And drift bends whole stretches of a trajectory, which no keyframe's gradient shows above its noise, but their sum
+    does. So rows move by the sum of such steps for all widths P of a stretch, 1, 2, 4, ... rows to either side (the
+    multilevel preconditioner of Bramble, Pasciak & Xu 1990): P C_P^(-1/2) P^T times the mean gradient, each row of
+    P^T the hat over one stretch. Without ``stretches``, for rows of one number, this is Adam.
+
+    ``eps`` is the share of a matrix' mean diagonal that is added to each direction's. Inverse roots are computed
+    anew for no more than 256 rows and stretches a step, in turn; they do not move until their first. Not ``coupled``,
+    each number is scaled by itself.
     """
 
     def __init__(
@@ -30,13 +36,14 @@ class KeyframeAdam(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.99),
         eps: float = 1e-3,
         coupled: bool = True,
+        stretches: bool = True,
     ):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
-        self.coupled = coupled
+        self.coupled, self.stretches = coupled, stretches
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Move every row by about the learning rate in each direction whose gradient keeps its sign."""
+        """Move every row and stretch by about the learning rate in each direction whose gradient keeps its sign."""
         assert closure is None
         for group in self.param_groups:
             for rows in group["params"]:
@@ -47,6 +54,8 @@ class KeyframeAdam(torch.optim.Optimizer):
         self, rows: Tensor, gradient: Float[Tensor, "rows dim"], betas: tuple[float, float], eps: float
     ) -> Float[Tensor, "rows dim"]:
         state, (beta1, beta2) = self.state[rows], betas
+        levels = _levels(gradient) if self.stretches else [gradient]
+        gradient = torch.cat(levels)
         count, dim = gradient.shape
         if not state:
             state["step"] = 0
@@ -59,7 +68,35 @@ class KeyframeAdam(torch.optim.Optimizer):
         seen = outer[due] if self.coupled else outer[due] * torch.eye(dim).to(outer)
         root[due] = _inverse_root(seen / (1 - beta2 ** (step + 1)), eps)
         state["step"] = step + 1
-        return (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
+        direction = (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
+        return _summed(direction.split([len(level) for level in levels]))
+
+
+def _levels(gradient: Float[Tensor, "rows dim"]) -> list[Float[Tensor, "_ dim"]]:
+    """The gradient of rows, and of stretches about every second, fourth, ... row, until there are but few.
+
+    A stretch is a hat: half of each row between two goes to either; one after the last goes to that whole.
+    """
+    levels = [gradient]
+    while len(levels[-1]) > _FEW:
+        finer = levels[-1]
+        coarser, between = finer[::2].clone(), finer[1::2]
+        coarser[: len(between)] += between / 2
+        coarser[1:] += between[: len(coarser) - 1] / 2
+        if len(between) == len(coarser):
+            coarser[-1] += between[-1] / 2
+        levels.append(coarser)
+    return levels
+
+
+def _summed(levels: tuple[Float[Tensor, "_ dim"], ...]) -> Float[Tensor, "rows dim"]:
+    """How rows move when they and their stretches move: what :func:`_levels` does, the other way about."""
+    *finer, total = levels
+    for level in reversed(finer):
+        following = torch.cat([total[1:], total[-1:]])
+        moved = torch.stack([total, (total + following) / 2], dim=1).flatten(0, 1)
+        total = level + moved[: len(level)]
+    return total
 
 
 def _inverse_root(outer: Float[Tensor, "rows dim dim"], eps: float) -> Float[Tensor, "rows dim dim"]:

@@ -60,14 +60,16 @@ class FusedAdamConfig(OptimizerConfig):
 
 @dataclass
 class KeyframeAdamConfig(OptimizerConfig):
-    """Adam with a second moment over the six numbers of a keyframe's correction."""
+    """Adam with a second moment over the six numbers of a keyframe's correction, and of whole stretches'."""
 
     _target: type = KeyframeAdam
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-3
-    """Share of a keyframe's mean second moment that counts for every direction."""
+    """Share of a keyframe's mean second moment that is added to that of every direction."""
     coupled: bool = True
     """Scale rotation and shift together, so that what tells them apart is followed; else each number by itself."""
+    stretches: bool = True
+    """Move stretches of the trajectory too, as drift bends them; else each keyframe for itself alone."""
 
 
 @dataclass

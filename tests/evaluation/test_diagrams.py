@@ -43,3 +43,27 @@ def test_tables_show_medians_and_what_was_not_reached():
     row = next(line for line in text.splitlines() if line.startswith("| room | white | ebarf | 10"))
     # 20 dB at once, 22 dB never; 5 cm at once, 2 cm after 20 s, 1 cm by one seed of three only.
     assert row == "| room | white | ebarf | 10 |" + " not reached |" * 4 + " 10 | 20 | not reached | not reached |"
+
+
+def test_tables_compare_each_seed_with_the_first_method_true_poses_and_the_given_trajectory():
+    true = [record("true poses", seed, [0.0, 0.0]) | {"trajectory": "true"} for seed in range(3)]
+    ours = [record("ebarf", seed, [0.04, final]) for seed, final in enumerate((0.01, 0.005, 0.03))]
+    other = [record("other", seed, [0.04, 0.05]) for seed in range(3)]
+    for part, psnr, steps in ((true, 22.0, 400), (ours, 21.0, 200), (other, 20.5, 100)):
+        for seed, one in enumerate(part):
+            one["evaluations"][-1] |= {"psnr": psnr + seed, "step": steps}
+    roles = {"ebarf": "method", "true poses": "floor", "other": "method"}
+    text = tables({"machine": "a machine", "date": "today", "roles": roles, "records": [*ours, *true, *other]})
+    left = "0.33 [0.33, 0.33]"
+    assert f"| room | white | ebarf | 20 s | - | -1.00 [-1.00, -1.00] | 0.20 [0.15, 0.40] | {left} | - |" in text
+    gains = "-0.50 [-0.50, -0.50] | -1.50 [-1.50, -1.50]"
+    assert f"| room | white | other | 20 s | {gains} | 1.00 [1.00, 1.00] | {left} | 2.00 [2.00, 2.00] |" in text
+
+
+def test_a_training_that_failed_is_compared_with_nothing():
+    ours, other = record("ebarf", 0, [0.01]), record("other", 0, [])
+    perfect = record("ebarf", 0, [0.01]) | {"trajectory": "perfect", "initial": {"ate_m": 1e-16, "rotation_deg": 0.0}}
+    roles = {"ebarf": "method", "other": "method"}
+    text = tables({"machine": "a machine", "date": "today", "roles": roles, "records": [ours, other, perfect]})
+    assert "| room | white | other | 20 s | - | - | - | - | - |" in text
+    assert "| room | perfect | ebarf | 20 s | - | - | - | - | - |" in text
