@@ -254,24 +254,26 @@ def _against_others(panels: Panels, roles: dict[str, str]) -> list[str]:
         *("position error left", "rotation error left", f"time a step over {first}"),
     )
     for (scene, trajectory), group in panels.items():
-        trainings = {tuple(record[key] for key in ("method", "seed", "seconds")): record for record in group}
+        ends = {(record["method"], record["seed"], record["seconds"]): _last(record) for record in group}
         for (method, seconds), own in _problems(group, "method", "seconds").items():
-            columns = []
+            compared = []
             for record in own:
-                end, initial = _last(record), record["initial"]
-                by_first, by_floor = (
-                    _last(trainings.get((other, record["seed"], seconds), {"evaluations": []}))
-                    for other in (first, floor)
-                )
-                left = (_ratio(error_of(end, name), error_of(initial, name)) for name in _POSE_ERRORS)
-                gains = (_psnr(end) - _psnr(by_first), _psnr(end) - _psnr(by_floor))
-                columns.append([*gains, *left, _ratio(_seconds_a_step(end), _seconds_a_step(by_first))])
-            own_column, *rest = (_spread(values) for values in zip(*columns, strict=True))
-            *rest, pace = rest
-            if method == first:
-                own_column = pace = "-"
-            lines += _row(scene, trajectory, method, f"{seconds:g} s", own_column, *rest, pace)
+                # Nothing is told of the first method against itself.
+                by_first = {} if method == first else ends.get((first, record["seed"], seconds), {})
+                by_floor = ends.get((floor, record["seed"], seconds), {})
+                compared.append(_compared(_last(record), record["initial"], by_first, by_floor))
+            cells = (_spread(values) for values in zip(*compared, strict=True))
+            lines += _row(scene, trajectory, method, f"{seconds:g} s", *cells)
     return lines
+
+
+def _compared(end: Record, initial: Record, by_first: Record, by_floor: Record) -> list[float]:
+    return [
+        _psnr(end) - _psnr(by_first),
+        _psnr(end) - _psnr(by_floor),
+        *(_ratio(error_of(end, name), error_of(initial, name)) for name in _POSE_ERRORS),
+        _ratio(_seconds_a_step(end), _seconds_a_step(by_first)),
+    ]
 
 
 def _seconds_until(panels: Panels) -> list[str]:
@@ -304,7 +306,7 @@ def _ratio(error: float, other: float) -> float:
 
 
 def _spread(values: Sequence[float]) -> str:
-    """Median and quartiles, of what is known of all."""
+    """Median and quartiles, where all of them are known."""
     if not np.isfinite(values).all():
         return "-"
     low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 _ROOTS_A_STEP = 256
 _FEW = 4
+"""Rows or stretches that no wider stretches are made of."""
 
 
 class KeyframeAdam(torch.optim.Optimizer):

@@ -83,10 +83,11 @@ def test_what_all_rows_say_moves_all_of_them_alike(count: int):
     assert (moved @ gradient.T < 0).all() and torch.allclose(moved, moved[:1].expand(count, -1), atol=1e-4)
 
 
-def test_turning_the_axes_turns_the_path():
+@pytest.mark.parametrize("count", [3, 10])
+def test_turning_the_axes_turns_the_path(count: int):
     turn = torch.linalg.qr(torch.randn(6, 6, generator=torch.Generator().manual_seed(1)))[0]
-    gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
-    plain, turned = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(3, 6))
+    gradients = torch.randn(20, count, 6, generator=torch.Generator().manual_seed(2))
+    plain, turned = rows_of(torch.zeros(count, 6)), rows_of(torch.zeros(count, 6))
     one, other = KeyframeAdam([plain]), KeyframeAdam([turned])
     for gradient in gradients:
         plain.grad, turned.grad = gradient, gradient @ turn
@@ -95,26 +96,27 @@ def test_turning_the_axes_turns_the_path():
     assert torch.allclose(plain @ turn, turned, atol=1e-4)
 
 
-@pytest.mark.parametrize(("stretches", "unmoved"), [(False, [7]), (True, [])])
+@pytest.mark.parametrize(("stretches", "steps", "unmoved"), [(False, 4, [7]), (True, 6, [])])
 def test_rows_without_a_gradient_move_with_their_neighbours_alone_and_many_rows_all_move(
-    stretches: bool, unmoved: list[int]
+    stretches: bool, steps: int, unmoved: list[int]
 ):
     rows = rows_of(torch.zeros(600, 6))
     optimizer = KeyframeAdam([rows], stretches=stretches)
     rows.grad = torch.randn(600, 6, generator=torch.Generator().manual_seed(0))
     rows.grad[7] = 0
-    for _ in range(6):
+    for _ in range(steps):
         optimizer.step()
     moved = rows.detach().abs().sum(dim=1)
     assert torch.isfinite(rows).all() and torch.nonzero(moved == 0)[:, 0].tolist() == unmoved
 
 
+@pytest.mark.parametrize("count", [3, 10])
 @pytest.mark.parametrize("size", [1e-15, 1e12])
-def test_the_size_of_the_loss_does_not_matter(size: float):
-    gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
+def test_the_size_of_the_loss_does_not_matter(size: float, count: int):
+    gradients = torch.randn(20, count, 6, generator=torch.Generator().manual_seed(2))
     ends = []
     for factor in (1.0, size):
-        rows = rows_of(torch.zeros(3, 6))
+        rows = rows_of(torch.zeros(count, 6))
         optimizer = KeyframeAdam([rows])
         for gradient in gradients:
             rows.grad = factor * gradient
@@ -123,9 +125,10 @@ def test_the_size_of_the_loss_does_not_matter(size: float):
     assert torch.allclose(*ends, atol=1e-4)
 
 
-def test_its_state_goes_on_as_if_never_stopped():
-    gradients = torch.randn(8, 3, 6, generator=torch.Generator().manual_seed(2))
-    whole, stopped = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(3, 6))
+@pytest.mark.parametrize("count", [3, 10])
+def test_its_state_goes_on_as_if_never_stopped(count: int):
+    gradients = torch.randn(8, count, 6, generator=torch.Generator().manual_seed(2))
+    whole, stopped = rows_of(torch.zeros(count, 6)), rows_of(torch.zeros(count, 6))
     one, other = KeyframeAdam([whole]), KeyframeAdam([stopped])
     for k, gradient in enumerate(gradients):
         whole.grad, stopped.grad = gradient, gradient
