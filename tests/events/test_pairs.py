@@ -209,6 +209,9 @@ def test_blind_times_are_seen_where_few_events_follow_soon():
     random = np.random.default_rng(0)
     assert spaced(1000 + random.gamma(2, 9000, 40_000)).refractory_us == pytest.approx(1000, rel=0.15)
     assert spaced(random.gamma(2, 9000, 40_000)).refractory_us == 0
+    # The longer the recording, the rarer they may be.
+    assert spaced(1000 + random.gamma(2, 20_000, 250_000)).refractory_us == pytest.approx(1000, rel=0.15)
+    assert spaced(random.gamma(2, 20_000, 250_000)).refractory_us == 0
 
 
 def test_few_intervals_say_nothing_of_blind_times():
@@ -245,6 +248,12 @@ def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
     pairs = index.draw(np.array([5]), np.random.default_rng(0), 1000)
     assert (pairs.polarity_sum[0], pairs.event_count[0]) == (polarity_sum, event_count)
     assert pairs.variance[0] == 5 + 8 * (event_count - 5)
+
+
+def test_what_was_missed_goes_by_the_faster_neighbour():
+    # A threshold takes 4 ms but for the one in the middle, 1 ms, as long as the pixel is blind before and after it.
+    pairs = spaced(np.array([5000, 2000, 5000])).draw(np.array([3]), np.random.default_rng(0), 1000)
+    assert pairs.polarity_sum[0] == 3 + 2
 
 
 def test_no_more_than_three_events_are_missed_at_a_time():
