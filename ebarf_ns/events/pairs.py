@@ -30,7 +30,6 @@ _ROUNDS = 100
 _ENOUGH_INTERVALS, _INTERVALS = 20_000, 200_000
 _MOST_OVER_USUAL, _ALWAYS_COUNT = 10, 200
 _MOST_MISSED = 3.0
-_NEVER_US = 1 << 62
 _VARIANCE_OF_MISSED = 8.0
 """Of a missed event, over that of one with a threshold of usual spread (5 %): 0.3 against 0.035 squared thresholds."""
 
@@ -108,7 +107,8 @@ class PairIndex:
         """How long pixels are blind after an event, as the times between their events tell; 0 where they do not.
 
         Behind such a time intervals pile up: the 60th shortest of up to 200,000 is less than a quarter longer than the
-        20th, and half of all are longer than twice that. As much shorter than the 20th is taken for it.
+        20th, and half of all are longer than twice that. The blind time is then as much shorter than the 20th as that
+        is than the 60th.
         """
         intervals = min(int(self.count(np.array(1))), _INTERVALS)
         if intervals < _ENOUGH_INTERVALS:
@@ -193,7 +193,7 @@ def _missed(events, k, first, refractory_us):
     before, event, after = events[k - 1], events[k], events[k + 1]
     polarity = event.running_polarity - before.running_polarity
     earlier = before.running_polarity - (events[k - 2].running_polarity if k - 2 >= first else 0)
-    interval_us = _NEVER_US
+    interval_us = np.inf
     if earlier == polarity:
         interval_us = event.t_us - before.t_us
     if after.running_polarity - event.running_polarity == polarity:
