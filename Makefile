@@ -20,7 +20,7 @@ check: setup
 	pyright --pythonpath $(abspath $(BIN)/python)
 
 test: check
-	pytest -m "not slow and not gpu" --durations=10
+	pytest -m "not slow and not gpu" -n 2 --dist loadscope --durations=10
 
 test-slow: check
 	pytest -m "slow"
