@@ -19,6 +19,7 @@ check: setup
 	ruff format --check .
 	pyright --pythonpath $(abspath $(BIN)/python)
 
+# Two at a time; tests of one file stay together, as they share scenes and runs.
 test: check
 	pytest -m "not slow and not gpu" -n 2 --dist loadscope --durations=10
 
