@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from ebarf_ns.scene import Scene
 
 _GROWTH = 1.6
-_STRAIGHT_PX = 0.25
+# What is not straight between learned corrections may be noise, which then stays: a fifth of a pixel costs 2 dB.
+_STRAIGHT_PX = 0.05
 _AS_GOOD_AS_STRAIGHT_PX = 0.02
 _UNEVEN = 4.0
 
@@ -167,7 +168,7 @@ def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:
 
 
 def _stride(smooth: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
-    """How far apart corrections are learned: as far as the motion between is straight to a quarter of a pixel."""
+    """How far apart corrections are learned: as far as the motion between is straight to a 20th of a pixel."""
     keyframes = len(smooth.t_us)
     stride, off_px = 1, 0.0
     while 2 * stride * 4 <= keyframes:

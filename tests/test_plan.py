@@ -89,6 +89,15 @@ def test_dense_keyframes_share_corrections_and_sparse_ones_do_not(scene: Scene):
     assert sparse == 1 < dense < denser
 
 
+def test_drift_between_keyframes_is_corrected_at_each(scene: Scene):
+    sharp = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=110.0))
+    slow = smooth_motion(40)
+    steps_m = torch.randn(slow.poses.position.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drifting = Trajectory(slow.t_us, Poses(slow.poses.position + 0.005 * steps_m.cumsum(0), slow.poses.quat_wxyz))
+    assert planned(sharp, trajectory=slow)["keyframe_stride"] == 2
+    assert planned(sharp, trajectory=drifting)["keyframe_stride"] == 1
+
+
 def test_what_was_set_stays_and_is_named():
     configuration = SimpleNamespace(model=SimpleNamespace(samples=None, grid_levels=5))
     lines = [Line("model.samples", 24, "enough"), Line("model.grid_levels", 8, "needed")]
