@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ebarf_ns.scene import Scene
 
 _GROWTH = 1.6
-# What is not straight between learned corrections may be noise, which then stays: a fifth of a pixel costs 2 dB.
+# What is not straight between learned corrections may be noise, which then stays: a fifth of a pixel cost 1 to 2 dB.
 _STRAIGHT_PX = 0.05
 _AS_GOOD_AS_STRAIGHT_PX = 0.02
 _UNEVEN = 4.0
