@@ -27,23 +27,17 @@ def _sinc(angle_squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """sin(a)/a as a function of a squared, smooth at 0."""
     small = angle_squared < _series_below(angle_squared)
     angle = torch.where(small, torch.ones_like(angle_squared), angle_squared).sqrt()
-    series = 1 - angle_squared / 6 * (1 - angle_squared / 20 * (1 - angle_squared / 42))
+    series = 1 - angle_squared / 6 * (1 - angle_squared / 20)
     return torch.where(small, series, angle.sin() / angle)
-
-
-def _cos(angle_squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """cos(a) as a function of a squared, smooth at 0."""
-    small = angle_squared < _series_below(angle_squared)
-    angle = torch.where(small, torch.ones_like(angle_squared), angle_squared).sqrt()
-    series = 1 - angle_squared / 2 * (1 - angle_squared / 12 * (1 - angle_squared / 30))
-    return torch.where(small, series, angle.cos())
 
 
 def quat_wxyz_exp(rotation_vector_rad: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     """The unit quaternion that rotates by ``|v|`` about ``v``; the identity, with gradient I/2, at 0."""
     half = rotation_vector_rad / 2
     angle_squared = (half * half).sum(-1, keepdim=True)
-    return torch.cat([_cos(angle_squared), half * _sinc(angle_squared)], dim=-1)
+    sinc, sinc_of_half = _sinc(torch.cat([angle_squared, angle_squared / 4], dim=-1)).split(1, dim=-1)
+    # cos(a) = 1 - 2 sin(a/2)^2
+    return torch.cat([1 - angle_squared / 2 * sinc_of_half**2, half * sinc], dim=-1)
 
 
 def quat_wxyz_log(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
@@ -53,9 +47,10 @@ def quat_wxyz_log(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
     sine_squared = (vector * vector).sum(-1, keepdim=True)
     small = sine_squared < _series_below(quat_wxyz)
     sine = torch.where(small, torch.ones_like(sine_squared), sine_squared).sqrt()
-    tangent_squared = sine_squared / torch.where(small, w, torch.ones_like(w)) ** 2
+    cosine = torch.where(small, w, torch.ones_like(w))
+    tangent_squared = sine_squared / cosine**2
     # atan(x)/x = 1 - x^2/3 + x^4/5 - ...; dividing by w makes it exact for quaternions a rounding off unit length.
-    series = 2 / torch.where(small, w, torch.ones_like(w)) * (1 - tangent_squared * (1 / 3 - tangent_squared / 5))
+    series = 2 / cosine * (1 - tangent_squared * (1 / 3 - tangent_squared / 5))
     return vector * torch.where(small, series, 2 * torch.atan2(sine, w) / sine)
 
 
@@ -67,17 +62,6 @@ def quat_wxyz_multiply(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"
 def quat_wxyz_conjugate(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """The inverse of a unit quaternion."""
     return torch.cat([quat_wxyz[..., :1], -quat_wxyz[..., 1:]], dim=-1)
-
-
-def slerp_wxyz(
-    a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"], fraction: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 4"]:
-    """Constant-velocity rotation from ``a`` (fraction 0) to ``b`` (1) along the shorter arc.
-
-    a · exp(fraction · log(a⁻¹ b)): regular where a = ±b; at exactly half a turn one of the two arcs is taken.
-    """
-    step = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(a), b))
-    return quat_wxyz_multiply(a, quat_wxyz_exp(fraction[..., None] * step))
 
 
 def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:

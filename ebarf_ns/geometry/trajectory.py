@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,6 @@ from ebarf_ns.geometry.so3 import (
     quat_wxyz_multiply,
     quat_wxyz_to_matrix,
     rotate,
-    slerp_wxyz,
 )
 
 if TYPE_CHECKING:
@@ -97,46 +97,43 @@ def interpolate(
     """The poses at ``t_us``: SLERP of the rotations and LERP of the positions (Eq. 3), or both with velocities that
     run on through the keyframes, as cubic splines have them.
 
+    SLERP from a to b is a · exp(u · log(a⁻¹ b)): regular where a = ±b; at exactly half a turn one of two arcs is taken.
     Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
     """
     left, exact_fraction = intervals(keyframe_t_us, t_us)
-    fraction = exact_fraction.to(keyframes.position)
-    a, b = (Poses(keyframes.position[k], keyframes.quat_wxyz[k]) for k in (left, left + 1))
-    line = Poses(
-        a.position + fraction[..., None] * (b.position - a.position), slerp_wxyz(a.quat_wxyz, b.quat_wxyz, fraction)
-    )
-    if kind == "linear":
-        return line
-    turn, shift = _bulge(keyframe_t_us, keyframes, left, fraction).split(3, dim=-1)
-    return Poses(line.position + shift, quat_wxyz_multiply(line.quat_wxyz, quat_wxyz_exp(turn)))
+    u = exact_fraction.to(keyframes.position)[..., None]
+    position, quat_wxyz = keyframes
+    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))
+    change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)
+    bends = _bends(keyframe_t_us, change) if kind == "cubic" else ()
+    # Looked up together: every table that is looked up costs a pass over the gradients of all times.
+    columns = torch.cat([position[:-1], quat_wxyz[:-1], change, *bends], dim=-1)
+    start, frame, change, *bends = columns[left].split([3, 4, 6, *(6 for _ in bends)], dim=-1)
+    moved = u * change
+    if bends:
+        moved = moved + ((1 - u) ** 3 - (1 - u)) * bends[0] + (u**3 - u) * bends[1]
+    return Poses(start + moved[..., 3:], quat_wxyz_multiply(frame, quat_wxyz_exp(moved[..., :3])))
 
 
-def _bulge(
-    keyframe_t_us: Int64[Tensor, "keyframes"],
-    keyframes: Poses,
-    left: Int64[Tensor, "*batch"],
-    fraction: Float[Tensor, "*batch"],
-) -> Float[Tensor, "*batch 6"]:
-    """What cubic splines add to straight lines between keyframes: a small rotation in the camera's frame, and a shift.
+def _bends(
+    keyframe_t_us: Int64[Tensor, "keyframes"], change: Float[Tensor, "intervals 6"]
+) -> tuple[Float[Tensor, "intervals 6"], Float[Tensor, "intervals 6"]]:
+    """Second derivatives at either end of each interval, over 6 and per interval squared, that make splines of lines.
 
     The rotations' spline is that of the body's angular velocity. It takes the frames of neighbouring keyframes for
     the same, which matters as little as the second derivative turns from one to the next. In the first and the last
     interval the second derivative is constant: zero at the ends, as of a natural spline, it would bend a motion that
     is under way when the recording begins, and the end keyframes with it.
     """
-    position, quat_wxyz = keyframes
-    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))
-    change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)
-    interval_s = keyframe_t_us.diff().double() * 1e-6
-    slope = change.double() / interval_s[:, None]
-    if len(slope) < 2:
-        return torch.zeros_like(change[left])
-    bend = torch.nn.functional.pad(6 * slope.diff(dim=0), (0, 0, 1, 1))
-    solved: Tensor = _SolveTridiagonal.apply(interval_s, bend).to(position)  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+    if len(change) < 2:
+        return torch.zeros_like(change), torch.zeros_like(change)
+    interval_s = (keyframe_t_us.diff().double() * 1e-6)[:, None]
+    steps = torch.nn.functional.pad(6 * (change.double() / interval_s).diff(dim=0), (0, 0, 1, 1))
+    solved: Tensor = _SolveTridiagonal.apply(interval_s, steps)  # pyright: ignore[reportAssignmentType]
     curvature = torch.cat([solved[1:2], solved[1:-1], solved[-2:-1]])
-    u = fraction[..., None]
-    before, after = ((1 - u) ** 3 - (1 - u)) * curvature[left], (u**3 - u) * curvature[left + 1]
-    return interval_s.to(position)[left][..., None] ** 2 / 6 * (before + after)
+    ends = (interval_s**2 / 6 * end for end in (curvature[:-1], curvature[1:]))
+    first, last = (end.to(change) for end in ends)
+    return first, last
 
 
 class _SolveTridiagonal(torch.autograd.Function):
@@ -156,13 +153,14 @@ def _solve_spline_system(interval_s: Tensor, right: Tensor) -> Tensor:
     """Second derivatives at all keyframes but the first and the last, which have those of their neighbours."""
     from scipy.linalg import solveh_banded
 
+    interval = interval_s[:, 0].cpu().numpy()
     # The rows of those two stand for themselves.
-    upper_bands = torch.zeros(2, len(interval_s) + 1, dtype=torch.float64)
-    upper_bands[0, 2:-1] = interval_s[1:-1]
+    upper_bands = np.zeros((2, len(interval) + 1))
+    upper_bands[0, 2:-1] = interval[1:-1]
     upper_bands[1] = 1.0
-    upper_bands[1, 1:-1] = 2 * (interval_s[1:] + interval_s[:-1])
-    upper_bands[1, 1] += interval_s[0]
-    upper_bands[1, -2] += interval_s[-1]
+    upper_bands[1, 1:-1] = 2 * (interval[1:] + interval[:-1])
+    upper_bands[1, 1] += interval[0]
+    upper_bands[1, -2] += interval[-1]
     # A gradient that is not finite goes on its way to where such steps are skipped.
-    solution = solveh_banded(upper_bands.numpy(), right.detach().cpu().numpy(), check_finite=False)
+    solution = solveh_banded(upper_bands, right.detach().cpu().numpy(), check_finite=False)
     return torch.from_numpy(solution).to(right)

@@ -1,10 +1,13 @@
 """Adam that knows that the six numbers of a keyframe belong together, and that neighbours move together."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.sparse import csr_matrix, identity, vstack
 from torch import Tensor
 
 _ROOTS_A_STEP = 256
@@ -55,8 +58,8 @@ class KeyframeAdam(torch.optim.Optimizer):
         self, rows: Tensor, gradient: Float[Tensor, "rows dim"], betas: tuple[float, float], eps: float
     ) -> Float[Tensor, "rows dim"]:
         state, (beta1, beta2) = self.state[rows], betas
-        levels = _levels(gradient) if self.stretches else [gradient]
-        gradient = torch.cat(levels)
+        stretches = _stretches(len(rows), rows.device) if self.stretches else None
+        gradient = gradient if stretches is None else stretches @ gradient
         count, dim = gradient.shape
         if not state:
             state["step"] = 0
@@ -70,34 +73,26 @@ class KeyframeAdam(torch.optim.Optimizer):
         root[due] = _inverse_root(seen / (1 - beta2 ** (step + 1)), eps)
         state["step"] = step + 1
         direction = (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
-        return _summed(direction.split([len(level) for level in levels]))
+        return direction if stretches is None else stretches.mT @ direction
 
 
-def _levels(gradient: Float[Tensor, "rows dim"]) -> list[Float[Tensor, "_ dim"]]:
-    """The gradient of rows, and of stretches about every second, fourth, ... row, until there are but few.
+@lru_cache(maxsize=4)
+def _stretches(count: int, device: torch.device) -> Float[Tensor, "stretches rows"]:
+    """What each row, and each stretch about every second, fourth, ... row, is made of, until there are but few; sparse.
 
     A stretch is a hat: half of each row between two goes to either; one after the last goes to that whole.
     """
-    levels = [gradient]
-    while len(levels[-1]) > _FEW:
-        finer = levels[-1]
-        coarser, between = finer[::2].clone(), finer[1::2]
-        coarser[: len(between)] += between / 2
-        coarser[1:] += between[: len(coarser) - 1] / 2
-        if len(between) == len(coarser):
-            coarser[-1] += between[-1] / 2
-        levels.append(coarser)
-    return levels
-
-
-def _summed(levels: tuple[Float[Tensor, "_ dim"], ...]) -> Float[Tensor, "rows dim"]:
-    """How rows move when they and their stretches move: what :func:`_levels` does, the other way about."""
-    *finer, total = levels
-    for level in reversed(finer):
-        following = torch.cat([total[1:], total[-1:]])
-        moved = torch.stack([total, (total + following) / 2], dim=1).flatten(0, 1)
-        total = level + moved[: len(level)]
-    return total
+    level, levels = identity(count, format="csr"), []
+    while True:
+        levels.append(level)
+        if count <= _FEW:
+            break
+        finer, count = np.arange(count), (count + 1) // 2
+        halves = np.r_[finer // 2, np.minimum((finer + 1) // 2, count - 1)]
+        level = csr_matrix((np.full(len(halves), 0.5), (halves, np.tile(finer, 2)))) @ level
+    stacked = vstack(levels).tocoo()
+    places, shares = torch.from_numpy(np.stack([stacked.row, stacked.col])), torch.from_numpy(stacked.data).float()
+    return torch.sparse_coo_tensor(places, shares, stacked.shape, device=device, check_invariants=True).coalesce()
 
 
 def _inverse_root(outer: Float[Tensor, "rows dim dim"], eps: float) -> Float[Tensor, "rows dim dim"]:

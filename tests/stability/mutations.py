@@ -32,12 +32,10 @@ FRACTION = "(t_us - keyframe_t_us[left]).double() / interval_us.double()"
 SAFE = "torch.where(small, torch.ones_like(angle_squared), angle_squared)"
 SINC = """    angle = torch.where(small, torch.ones_like(angle_squared), angle_squared).sqrt()
     series = 1 - angle_squared / 6"""
-COS = """    angle = torch.where(small, torch.ones_like(angle_squared), angle_squared).sqrt()
-    series = 1 - angle_squared / 2"""
-STEP = "    step = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(a), b))\n"
+TURN = "    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))\n"
 SHORTER = "    quat_wxyz = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)\n"
-SLERP = "return quat_wxyz_multiply(a, quat_wxyz_exp(fraction[..., None] * step))"
-NLERP = "return torch.nn.functional.normalize(torch.lerp(a, b, fraction[..., None]), dim=-1)"
+SLERP = "quat_wxyz_multiply(frame, quat_wxyz_exp(moved[..., :3])))"
+NLERP = "torch.nn.functional.normalize(torch.lerp(frame, quat_wxyz[left + 1], u), dim=-1))"
 FLOATS = (
     "(t_us.float() - keyframe_t_us[left].float()) / (keyframe_t_us[left + 1].float() - keyframe_t_us[left].float())"
 )
@@ -46,22 +44,23 @@ NO_INFORMATION = "if len(change) < 2 or not bool(reported.any()):"
 MUTATIONS = (
     Mutation(1, SO3, SINC, SINC.replace(SAFE, "angle_squared"),
              "test_rotation.py::test_case_01_exp_is_exact_from_zero_on"),
-    Mutation(2, SO3, "series = 1 - angle_squared / 6 * (1 - angle_squared / 20 * (1 - angle_squared / 42))",
+    Mutation(2, SO3, "series = 1 - angle_squared / 6 * (1 - angle_squared / 20)",
              "series = 1 - angle_squared / 6",
              "test_rotation.py::test_case_02_series_and_formula_meet_without_a_step"),
     Mutation(3, SO3, SHORTER, "",
              "test_rotation.py::test_case_03_log_comes_back_from_half_a_turn_and_from_a_whole_one"),
     Mutation(4, SO3, "2 * torch.atan2(sine, w) / sine", "2 * torch.acos(w.clamp(-1, 1)) / sine",
              "test_rotation.py::test_case_04_small_relative_angles_do_not_vanish"),
-    Mutation(5, SO3, STEP, STEP.rstrip() + " * torch.sign((a * b).sum(-1, keepdim=True))\n",
+    Mutation(5, TRAJECTORY, TURN,
+             TURN.rstrip() + " * torch.sign((quat_wxyz[:-1] * quat_wxyz[1:]).sum(-1, keepdim=True))\n",
              "test_rotation.py::test_case_05_either_sign_of_a_quaternion_is_the_same_pose_with_the_same_gradient"),
-    Mutation(6, SO3, SLERP, NLERP,
+    Mutation(6, TRAJECTORY, SLERP, NLERP,
              "test_rotation.py::test_case_06_slerp_meets_its_ends_at_unit_length_and_constant_velocity"),
-    Mutation(7, SO3, COS, COS.replace(SAFE, "angle_squared"),
+    Mutation(7, SO3, SINC, SINC.replace(SAFE, "angle_squared"),
              "test_rotation.py::test_case_07_gradients_are_those_of_finite_differences"),
-    Mutation(8, SO3, "half * _sinc(angle_squared)], dim=-1)", "half * _sinc(angle_squared + 1e-4)], dim=-1)",
+    Mutation(8, SO3, "half * sinc], dim=-1)", "half * (sinc - 2e-5)], dim=-1)",
              "test_rotation.py::test_case_08_ten_thousand_steps_keep_unit_length_and_need_no_noise"),
-    Mutation(9, SO3, COS, COS.replace(SAFE, "angle_squared"),
+    Mutation(9, SO3, SINC, SINC.replace(SAFE, "angle_squared"),
              "test_rotation.py::test_case_09_poses_converge_from_any_rotation_error"),
     Mutation(10, TRAJECTORY, FRACTION, FLOATS,
              "test_trajectory.py::test_case_10_time_is_exact_at_any_epoch_and_over_any_span"),
@@ -78,8 +77,8 @@ MUTATIONS = (
              "test_trajectory.py::test_case_13_keyframes_a_microsecond_apart_have_finite_gradients"),
     Mutation(14, TRAJECTORY, 'kind: Interpolation = "linear"', 'kind: Interpolation = "cubic"',
              "test_trajectory.py::test_case_14_an_event_moves_the_keyframes_around_it_and_no_other"),
-    Mutation(15, TRAJECTORY, "fraction = exact_fraction.to(keyframes.position)",
-             "fraction = ((exact_fraction + exact_fraction.mean()) - exact_fraction.mean()).to(keyframes.position)",
+    Mutation(15, TRAJECTORY, "u = exact_fraction.to(keyframes.position)",
+             "u = ((exact_fraction + exact_fraction.mean()) - exact_fraction.mean()).to(keyframes.position)",
              "test_trajectory.py::test_case_15_order_and_batch_size_change_no_bit"),
     Mutation(16, BRIGHTNESS, "safe = torch.where(linear, torch.full_like(value, LIN_LOG_KNEE), value)", "safe = value",
              "test_photometry.py::test_case_16_brightness_is_finite_rising_and_of_bounded_slope"),
@@ -107,7 +106,7 @@ MUTATIONS = (
              "test_training.py::test_case_25_a_full_disk_leaves_the_older_checkpoint"),
     Mutation(26, MODEL, "self.random.manual_seed(seed * 1_000_003 + step)", "pass",
              "test_training.py::test_case_26_a_run_resumed_in_another_process_ends_bitwise_where_an_uninterrupted_one_does"),
-    Mutation(27, TRAINER, "all(bool(torch.isfinite(gradient.sum())) for gradient in gradients)", "True",
+    Mutation(27, TRAINER, "bool(torch.stack([gradient.sum() for gradient in gradients]).isfinite().all())", "True",
              "test_training.py::test_case_27_a_step_with_a_broken_gradient_changes_nothing"),
     Mutation(28, TRAINER, " if p.grad is not None]", "]",
              "test_training.py::test_case_28_poses_without_gradients_under_mixed_precision_do_not_end_the_run"),

@@ -15,8 +15,8 @@ from ebarf_ns.geometry.so3 import (
     quat_wxyz_log,
     quat_wxyz_multiply,
     quat_wxyz_to_matrix,
-    slerp_wxyz,
 )
+from ebarf_ns.geometry.trajectory import Poses, interpolate
 
 F32, F64 = torch.float32, torch.float64
 VALUE = {F32: 2e-7, F64: 1e-15}
@@ -45,6 +45,14 @@ def some_quats(count: int, dtype: torch.dtype, seed: int = 0) -> torch.Tensor:
 
 def angle_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(a), b)).norm(dim=-1)
+
+
+def interpolated(a: torch.Tensor, b: torch.Tensor, share: float) -> torch.Tensor:
+    """What is ``share`` of the way from one keyframe's rotation to the next one's."""
+    t_us = torch.tensor([0, 10**6])
+    ends = torch.stack([a, b], dim=-2).reshape(-1, 2, 4)
+    at = [interpolate(t_us, Poses(pair.new_zeros(2, 3), pair), torch.tensor(round(share * 10**6))) for pair in ends]
+    return torch.stack([pose.quat_wxyz for pose in at]).view_as(a)
 
 
 def jacobian(function, at: torch.Tensor) -> torch.Tensor:
@@ -126,12 +134,11 @@ def test_case_04_small_relative_angles_do_not_vanish(dtype: torch.dtype, angle_r
 def test_case_05_either_sign_of_a_quaternion_is_the_same_pose_with_the_same_gradient(dtype: torch.dtype, dot: float):
     a = torch.tensor([1.0, 0, 0, 0], dtype=dtype)
     b = torch.tensor([dot, *(math.sqrt(max(0.0, 1 - dot * dot)) * AXIS)], dtype=dtype)
-    share = torch.tensor(0.3, dtype=dtype)
     poses, gradients = [], []
     for sign_a, sign_b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         turn = torch.zeros(3, dtype=dtype, requires_grad=True)
         moved = quat_wxyz_multiply(sign_b * b, quat_wxyz_exp(turn))
-        pose = quat_wxyz_to_matrix(slerp_wxyz(sign_a * a, moved, share))
+        pose = quat_wxyz_to_matrix(interpolated(sign_a * a, moved, 0.3))
         poses.append(pose.detach())
         gradients.append(torch.autograd.grad((pose * torch.arange(9.0).view(3, 3).to(dtype)).sum(), turn)[0])
         assert torch.isfinite(gradients[-1]).all()
@@ -152,14 +159,13 @@ def test_case_05_either_sign_of_a_quaternion_is_the_same_pose_with_the_same_grad
 def test_case_06_slerp_meets_its_ends_at_unit_length_and_constant_velocity(dtype: torch.dtype):
     a, b, c = some_quats(24, dtype).chunk(3)
     for share, end in ((0.0, a), (1.0, b)):
-        at = slerp_wxyz(a, b, torch.full((8,), share, dtype=dtype))
+        at = interpolated(a, b, share)
         assert (torch.sign((at * end).sum(-1, keepdim=True)) * at - end).abs().max() <= 4 * ENDPOINT[dtype]
-    shares = torch.linspace(0, 1, 11, dtype=dtype)
-    steps = torch.stack([slerp_wxyz(a, b, share.expand(8)) for share in shares])
+    steps = torch.stack([interpolated(a, b, share / 10) for share in range(11)])
     assert (steps.norm(dim=-1) - 1).abs().max() <= 4 * UNIT_LENGTH[dtype]
     turned = angle_between(steps[:-1], steps[1:])
     assert (turned / turned[:1] - 1).abs().max() <= 10 * CONSTANT_VELOCITY[dtype]
-    left = [slerp_wxyz(quat_wxyz_multiply(c, a), quat_wxyz_multiply(c, b), shares[3].expand(8))]
+    left = [interpolated(quat_wxyz_multiply(c, a), quat_wxyz_multiply(c, b), 0.3)]
     left.append(quat_wxyz_multiply(c, steps[3]))
     assert (quat_wxyz_to_matrix(left[0]) - quat_wxyz_to_matrix(left[1])).abs().max() <= INVARIANCE[dtype]
 
@@ -170,15 +176,15 @@ def test_case_07_gradients_are_those_of_finite_differences(equal: bool, share: f
     a, b = some_quats(2, F64)
     b = a.clone() if equal else b
 
-    def interpolated(v: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+    def moved(v: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
         start, end = (quat_wxyz_multiply(quat.to(v), quat_wxyz_exp(turn)) for quat, turn in ((a, v), (b, w)))
-        return slerp_wxyz(start, end, torch.tensor(share).to(v))
+        return interpolated(start, end, share)
 
     zeros = [torch.zeros(3, dtype=F64, requires_grad=True) for _ in range(2)]
-    assert gradcheck(interpolated, zeros, eps=1e-6, atol=1e-6, rtol=1e-4)
-    exact = torch.cat([row.flatten() for row in torch.autograd.functional.jacobian(interpolated, tuple(zeros))])
+    assert gradcheck(moved, zeros, eps=1e-6, atol=1e-6, rtol=1e-4)
+    exact = torch.cat([row.flatten() for row in torch.autograd.functional.jacobian(moved, tuple(zeros))])
     singles = tuple(zero.detach().float() for zero in zeros)
-    single = torch.cat([row.flatten() for row in torch.autograd.functional.jacobian(interpolated, singles)]).double()
+    single = torch.cat([row.flatten() for row in torch.autograd.functional.jacobian(moved, singles)]).double()
     assert torch.cosine_similarity(single, exact, dim=0) >= SINGLE_COSINE
     assert (single - exact).norm() / exact.norm() <= SINGLE_RELATIVE
 
