@@ -131,8 +131,7 @@ def _bends(
     steps = torch.nn.functional.pad(6 * (change.double() / interval_s).diff(dim=0), (0, 0, 1, 1))
     solved: Tensor = _SolveTridiagonal.apply(interval_s, steps)  # pyright: ignore[reportAssignmentType]
     curvature = torch.cat([solved[1:2], solved[1:-1], solved[-2:-1]])
-    ends = (interval_s**2 / 6 * end for end in (curvature[:-1], curvature[1:]))
-    first, last = (end.to(change) for end in ends)
+    first, last = ((interval_s**2 / 6 * end).to(change) for end in (curvature[:-1], curvature[1:]))
     return first, last
 
 

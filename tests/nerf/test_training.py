@@ -11,7 +11,7 @@ import torch
 
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf import method
-from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig
+from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig, GuardedOptimizers
 
 
 def config(scene: Path, output: Path, name: str = "ebarf", steps: int = 12) -> EbarfTrainerConfig:
@@ -243,3 +243,9 @@ def test_a_resumed_run_keeps_its_plan(tiny_scene: Path, tmp_path: Path):
     assert second.pipeline.model.renderer.field.grid.shape.finest == 77
     reasons = {line.field: line.reason for line in second.plan}
     assert reasons["pipeline.model.grid_finest"] == "as in the run resumed"
+
+
+def test_a_step_in_which_no_group_is_due_is_not_a_broken_one():
+    optimizers = GuardedOptimizers({}, {})
+    optimizers.optimizer_scaler_step_some(torch.amp.GradScaler(enabled=False), [])
+    assert optimizers.skipped == 0
