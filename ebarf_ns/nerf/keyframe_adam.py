@@ -1,5 +1,6 @@
 """Adam that knows that the six numbers of a keyframe belong together, and that neighbours move together."""
 
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -58,8 +59,8 @@ class KeyframeAdam(torch.optim.Optimizer):
         self, rows: Tensor, gradient: Float[Tensor, "rows dim"], betas: tuple[float, float], eps: float
     ) -> Float[Tensor, "rows dim"]:
         state, (beta1, beta2) = self.state[rows], betas
-        stretches = _stretches(len(rows), rows.device) if self.stretches else None
-        gradient = gradient if stretches is None else stretches @ gradient
+        onto_stretches, onto_rows = _stretches(len(rows), rows.device, rows.dtype) if self.stretches else (None, None)
+        gradient = gradient if onto_stretches is None else onto_stretches @ gradient
         count, dim = gradient.shape
         if not state:
             state["step"] = 0
@@ -73,14 +74,17 @@ class KeyframeAdam(torch.optim.Optimizer):
         root[due] = _inverse_root(seen / (1 - beta2 ** (step + 1)), eps)
         state["step"] = step + 1
         direction = (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
-        return direction if stretches is None else stretches.mT @ direction
+        return direction if onto_rows is None else onto_rows @ direction
 
 
 @lru_cache(maxsize=4)
-def _stretches(count: int, device: torch.device) -> Float[Tensor, "stretches rows"]:
+def _stretches(
+    count: int, device: torch.device, dtype: torch.dtype
+) -> tuple[Float[Tensor, "stretches rows"], Float[Tensor, "rows stretches"]]:
     """What each row, and each stretch about every second, fourth, ... row, is made of, until there are but few; sparse.
 
-    A stretch is a hat: half of each row between two goes to either; one after the last goes to that whole.
+    A stretch is a hat: half of each row between two goes to either; one after the last goes to that whole. And the
+    same the other way about, since a product with a transposed view takes many times as long.
     """
     level, levels = identity(count, format="csr"), []
     while True:
@@ -90,9 +94,16 @@ def _stretches(count: int, device: torch.device) -> Float[Tensor, "stretches row
         finer, count = np.arange(count), (count + 1) // 2
         halves = np.r_[finer // 2, np.minimum((finer + 1) // 2, count - 1)]
         level = csr_matrix((np.full(len(halves), 0.5), (halves, np.tile(finer, 2)))) @ level
-    stacked = vstack(levels).tocoo()
-    places, shares = torch.from_numpy(np.stack([stacked.row, stacked.col])), torch.from_numpy(stacked.data).float()
-    return torch.sparse_coo_tensor(places, shares, stacked.shape, device=device, check_invariants=True).coalesce()
+    stacked = csr_matrix(vstack(levels))
+    return _as_tensor(stacked, device, dtype), _as_tensor(csr_matrix(stacked.T), device, dtype)
+
+
+def _as_tensor(sparse: csr_matrix, device: torch.device, dtype: torch.dtype) -> Tensor:
+    sparse.sort_indices()
+    parts = (torch.from_numpy(part) for part in (sparse.indptr, sparse.indices, sparse.data))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
+        return torch.sparse_csr_tensor(*parts, size=sparse.shape, dtype=dtype, device=device, check_invariants=True)
 
 
 def _inverse_root(outer: Float[Tensor, "rows dim dim"], eps: float) -> Float[Tensor, "rows dim dim"]:
