@@ -132,7 +132,8 @@ class EbarfTrainerConfig(TrainerConfig):
     evaluations: int = 8
     """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
     restart_field_at: float | None = 0.07
-    """Fraction of the budget after which the field starts again with the poses refined so far; None: never."""
+    """Fraction of the budget after which the field starts again with the poses refined so far; None: never.
+    Where poses are frozen, there is nothing to start again for."""
 
 
 class EbarfTrainer(Trainer):
@@ -233,7 +234,8 @@ class EbarfTrainer(Trainer):
                 scheduler.progress = before
         self.pipeline.model.follow_budget(before)
         restart_at = self.config.restart_field_at
-        if restart_at is not None and before >= restart_at and not self.field_restarted:
+        refining = self.pipeline.model.camera_optimizer.config.mode == "refine"
+        if refining and restart_at is not None and before >= restart_at and not self.field_restarted:
             self._restart_field()
         try:
             result = super().train_iteration(step)

@@ -107,6 +107,14 @@ def test_seconds_end_a_run_and_drive_its_schedules(tiny_scene: Path, tmp_path: P
     assert rate < 0.3 * made.optimizers["fields"]["optimizer"].lr
 
 
+def test_under_frozen_poses_the_field_has_nothing_to_start_again_for(tiny_scene: Path, tmp_path: Path):
+    made = config(tiny_scene, tmp_path, steps=3)
+    made.pipeline.model.camera_optimizer.mode = "off"  # pyright: ignore[reportAttributeAccessIssue]
+    ready = trainer(made)
+    ready.train()
+    assert ready.steps_done == 3 and not ready.field_restarted
+
+
 def test_equal_seeds_give_equal_runs_and_others_do_not(tiny_scene: Path, tmp_path: Path):
     ends = []
     for seed in (1, 1, 2):
