@@ -109,10 +109,10 @@ class GuardedOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Raises :class:`TrainingError` when too many steps in a row had to be skipped."""
         gradients = [p.grad for group in param_groups for p in self.parameters[group] if p.grad is not None]
-        # A gradient scaler looks for overflow itself, and lowers its scale when it finds it.
-        sums = [gradient.sum() for gradient in gradients]
-        # Accumulating gradients, no group may be due.
-        if grad_scaler.is_enabled() or not sums or bool(torch.stack(sums).isfinite().all()):
+        # A gradient scaler looks for overflow itself, and lowers its scale when it finds it. Accumulating gradients, no
+        # group may be due.
+        trusted = grad_scaler.is_enabled() or not gradients
+        if trusted or bool(torch.stack([gradient.sum() for gradient in gradients]).isfinite().all()):
             self.skipped_in_a_row = 0
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
