@@ -181,9 +181,9 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
         ("events within it", f"{summary.events_within_trajectory:,} ({within:.1%})"),
         (
             "thresholds",
-            f"on {threshold[0]}, off {threshold[1]}: threshold loss (Eq. 5)"
+            f"on {threshold[0]}, off {threshold[1]}; their ratio is corrected in training"
             if threshold
-            else "unknown: normalised loss (Eq. 6)",
+            else "unknown: their ratio is learned, and their scale matters little",
         ),
         (
             "distortion",

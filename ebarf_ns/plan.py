@@ -63,16 +63,9 @@ def plan_for(
     smooth, distance = smoothed(trajectory), _distance(scene, trajectory)[0] if scene.bounds is not None else None
     stride, straight = _stride(smooth, scene.camera.fx, distance)
     precision = fastest_precision(device)
-    threshold, bounded = scene.contrast_threshold, scene.bounds is not None
+    bounded = scene.bounds is not None
     rays = 16384 if device == "cuda" else 1024
     return [
-        Line(
-            "pipeline.model.loss",
-            "threshold" if threshold else "normalized",
-            f"contrast thresholds are known, on {threshold.on} and off {threshold.off}: Eq. 5"
-            if threshold
-            else "contrast thresholds are unknown: Eq. 6",
-        ),
         Line(
             "pipeline.model.contract",
             not bounded,

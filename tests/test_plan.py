@@ -26,9 +26,8 @@ def planned(scene: Scene, events: int = 500_000, trajectory: Trajectory | None =
 
 
 def test_parts_exist_only_where_the_scene_needs_them(scene: Scene):
-    assert planned(scene)["contract"] is False and planned(scene)["loss"] == "threshold"
-    bare = dataclasses.replace(scene, bounds=None, contrast_threshold=None)
-    assert planned(bare)["contract"] is True and planned(bare)["loss"] == "normalized"
+    assert planned(scene)["contract"] is False
+    assert planned(dataclasses.replace(scene, bounds=None))["contract"] is True
 
 
 def test_resolution_follows_the_pixel_footprint(scene: Scene):
@@ -113,10 +112,10 @@ def test_inspect_prints_the_plan_a_run_keeps_and_flags_overrule(trained_run: Pat
     shown = {line["field"]: line for line in json.loads(run_ok("ebarf", "inspect", tiny_scene, "--json"))["plan"]}
     kept = json.loads((trained_run / "metrics.jsonl").read_text().splitlines()[0])["plan"]
     assert shown.keys() == kept.keys()
-    assert kept["pipeline.model.loss"] == {k: shown["pipeline.model.loss"][k] for k in ("value", "reason")}
+    assert kept["pipeline.model.contract"] == {k: shown["pipeline.model.contract"][k] for k in ("value", "reason")}
     assert kept["pipeline.model.samples"]["value"] == 24 and "set by flag" in kept["pipeline.model.samples"]["reason"]
     text = run_ok("ebarf", "inspect", tiny_scene)
-    assert "--pipeline.model.grid-finest" in text and "Eq. 5" in text
+    assert "--pipeline.model.grid-finest" in text and "no contraction" in text and "their ratio is corrected" in text
     assert "samples: 24" in (trained_run / "config.yml").read_text()
 
 

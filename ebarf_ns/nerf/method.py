@@ -20,13 +20,11 @@ def _trainer(
     model: EbarfModelConfig,
     field_rate: float,
     poses: OptimizerConfig,
-    restart_field_at: float | None = None,
 ) -> EbarfTrainerConfig:
     return EbarfTrainerConfig(
         method_name=method_name,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=6000,
-        restart_field_at=restart_field_at,
         # Evaluation goes by the budget, see EbarfTrainerConfig.evaluations.
         steps_per_eval_batch=10**9,
         steps_per_eval_image=10**9,
@@ -83,7 +81,6 @@ ebarf = MethodSpecification(
         EbarfModelConfig(),
         field_rate=1e-2,
         poses=KeyframeAdamConfig(lr=0.03),
-        restart_field_at=0.07,
     ),
     description="NeRF from an event camera and its imperfect trajectory, which is refined on the way.",
 )

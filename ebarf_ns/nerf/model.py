@@ -20,9 +20,10 @@ from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
 from ebarf_ns.radiance.hash_grid import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
-from ebarf_ns.scene import Scene
+from ebarf_ns.scene import ContrastThreshold, Scene
 
-_FIRST_LEVELS = 2
+# Log brightness is known up to a factor, so that the scale matters little: 0.1 or 0.6 for a 0.25 cost 1 to 2 dB.
+_UNKNOWN_THRESHOLDS = ContrastThreshold(0.25, 0.25)
 T = TypeVar("T")
 
 
@@ -40,8 +41,8 @@ class EbarfModelConfig(ModelConfig):
     _target: type = field(default_factory=lambda: EbarfModel)
     eval_num_rays_per_chunk: int = 4096
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
-    loss: Literal["threshold", "normalized"] | None = None
-    """Eq. 5 with the scene's contrast thresholds, or Eq. 6 without; None: as planned."""
+    loss: Literal["threshold", "normalized"] = "threshold"
+    """Eq. 5, with thresholds taken as equal where the scene does not give them; or the paper's Eq. 6."""
     outliers_from: float | None = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     render_variance: float = 5.0
@@ -64,8 +65,6 @@ class EbarfModelConfig(ModelConfig):
     """Cells per side of the finest level; None: as planned."""
     grid_table_size_log2: int | None = None
     """Rows of the table a level; None: as planned."""
-    all_levels_from: float = 0.0
-    """Fraction of the budget over which the grid's levels come in, coarse to fine (BARF); 0: all from the start."""
     sampling: Literal["importance", "uniform"] = "importance"
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
     samples: int | None = None
@@ -80,8 +79,6 @@ class EbarfModelConfig(ModelConfig):
     """Cells per side of the remembered density; None: as planned."""
     near: float = Sampling.near
     """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
-    density_bias: float = 0.0
-    """Log density at the start of training."""
     precision: Precision | None = None
     """Of the MLPs' products; None: as planned."""
 
@@ -96,14 +93,10 @@ class EbarfModel(Model):
         super().populate_modules()
         config, scene = self.config, self.kwargs["metadata"]["scene"]
         assert isinstance(scene, Scene)
-        threshold = scene.contrast_threshold
-        if config.loss == "threshold" and threshold is None:
-            path = scene.folder / "scene.json"
-            raise TrainingError(f"{path}: no contrast_threshold, which --pipeline.model.loss threshold needs")
         self.normalized = config.loss == "normalized"
-        # Without thresholds, polarities are compared in units of one common threshold.
-        on, off = (threshold.on, threshold.off) if threshold and not self.normalized else (1.0, 1.0)
-        # Without the thresholds' scale, a loss can be had for nothing by letting one of them vanish.
+        # The paper's Eq. 6 takes polarities as they are, and knows no scale that a ratio could be learned in.
+        given = scene.contrast_threshold or _UNKNOWN_THRESHOLDS
+        on, off = (1.0, 1.0) if self.normalized else (given.on, given.off)
         self.sensor = SensorResponse(on, off, config.learn_sensor and not self.normalized)
         self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
@@ -118,7 +111,6 @@ class EbarfModel(Model):
             not _planned(config.contract),
             config.view_dependent,
             config.intensity_range,
-            density_bias=config.density_bias,
             precision=_planned(config.precision),
         )
         sampling = Sampling(
@@ -154,16 +146,6 @@ class EbarfModel(Model):
         """
         self.random.manual_seed(seed * 1_000_003 + step)
         self.renderer.begin_step(step, self.random)
-
-    def follow_budget(self, progress: float) -> None:
-        """Let in the grid's levels that are due at this fraction of the budget."""
-        levels, until = _planned(self.config.grid_levels), self.config.all_levels_from
-        share = min(progress / until, 1.0) if until else 1.0
-        self.renderer.field.grid.open_levels(_FIRST_LEVELS + share * (levels - _FIRST_LEVELS))
-
-    def restart_field(self) -> None:
-        """Forget the field and keep the poses."""
-        self.renderer.reset()
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, and what the

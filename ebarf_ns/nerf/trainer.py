@@ -131,9 +131,6 @@ class EbarfTrainerConfig(TrainerConfig):
     """End after this many seconds of training, evaluation and loading excluded; all schedules follow."""
     evaluations: int = 8
     """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
-    restart_field_at: float | None = 0.07
-    """Fraction of the budget after which the field starts again with the poses refined so far; None: never.
-    Where poses are frozen, there is nothing to start again for."""
 
 
 class EbarfTrainer(Trainer):
@@ -148,7 +145,6 @@ class EbarfTrainer(Trainer):
         self.train_seconds = 0.0
         self.event_pairs = 0
         self.steps_done = 0
-        self.field_restarted = False
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
             for flag in ("max_num_iterations", "max_train_seconds"):
@@ -232,11 +228,6 @@ class EbarfTrainer(Trainer):
         for scheduler in self.optimizers.schedulers.values():
             if isinstance(scheduler, BudgetDecay):
                 scheduler.progress = before
-        self.pipeline.model.follow_budget(before)
-        restart_at = self.config.restart_field_at
-        refining = self.pipeline.model.camera_optimizer.config.mode == "refine"
-        if refining and restart_at is not None and before >= restart_at and not self.field_restarted:
-            self._restart_field()
         try:
             result = super().train_iteration(step)
         except TrainingError as error:
@@ -255,21 +246,12 @@ class EbarfTrainer(Trainer):
         return result
 
     def _agreed(self, seconds: float) -> float:
-        """The first process's clock: all processes must take schedules, restart and end at the same step."""
+        """The first process's clock: all processes must take schedules and end at the same step."""
         if self.world_size == 1:
             return seconds
         clock = torch.tensor([seconds], dtype=torch.float64, device=self.device)
         torch.distributed.broadcast(clock, 0)
         return float(clock)
-
-    def _restart_field(self) -> None:
-        """A field trained under wrong poses holds them in place: learn it anew under the refined ones."""
-        self.field_restarted = True
-        # The same new field in every process, and in a run that was resumed.
-        with torch.random.fork_rng():
-            torch.manual_seed(self.config.machine.seed)
-            self.pipeline.model.restart_field()
-        self.optimizers.optimizers["fields"].state.clear()
 
     @check_main_thread
     def _evaluate(self, step: int, loss: float) -> None:
@@ -339,7 +321,6 @@ class EbarfTrainer(Trainer):
             "ebarf": {
                 "train_seconds": self.train_seconds,
                 "event_pairs": self.event_pairs,
-                "field_restarted": self.field_restarted,
                 "skipped_steps": self.optimizers.skipped,
             },
         }
@@ -366,7 +347,6 @@ class EbarfTrainer(Trainer):
             ours = state.get("ebarf", {})
             self.train_seconds = ours.get("train_seconds", 0.0)
             self.event_pairs = ours.get("event_pairs", 0)
-            self.field_restarted = ours.get("field_restarted", False)
             self.optimizers.skipped = ours.get("skipped_steps", 0)
             self.steps_done = self._start_step
 

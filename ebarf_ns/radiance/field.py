@@ -55,32 +55,23 @@ class RadianceField(nn.Module):
         view_dependent: bool = False,
         intensity_range: IntensityRange = "positive",
         hidden: int = 64,
-        density_bias: float = 0.0,
         precision: Precision = "float32",
     ):
         super().__init__()
         self.bounded = bounded
         self.view_dependent = view_dependent
         self.intensity_range = intensity_range
-        self.density_bias = density_bias
         self.precision = precision
         self.grid = HashGrid(shape)
         self.trunk = nn.Sequential(nn.Linear(shape.width, hidden), nn.ReLU(), nn.Linear(hidden, 16))
         inputs = 15 + (8 if view_dependent else 0)
         self.head = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1))
 
-    def reset(self) -> None:
-        """Forget everything learned."""
-        self.grid.reset()
-        for module in (*self.trunk, *self.head):
-            if isinstance(module, nn.Linear):
-                module.reset_parameters()
-
     def _unit_cube(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
         return (point + 1) / 2 if self.bounded else (contract(point) + 2) / 4
 
     def _activate_density(self, raw: Float[Tensor, "points"]) -> Float[Tensor, "points"]:
-        return (raw + self.density_bias).clamp(max=_MAX_LOG_DENSITY).exp()
+        return raw.clamp(max=_MAX_LOG_DENSITY).exp()
 
     def _half(self, device: torch.device) -> torch.autocast:
         return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")

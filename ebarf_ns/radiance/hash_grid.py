@@ -72,15 +72,12 @@ class Lattice(nn.Module):
         self.register_buffer("stretch", torch.tensor(shape.scales).float() * shape.reach, persistent=False)
         self.register_buffer("resolution", torch.tensor(shape.resolutions), persistent=False)
         self.register_buffer("first_row", torch.tensor([0, *np.cumsum(shape.rows)]), persistent=False)
-        self.register_buffer("level_weight", torch.ones(shape.levels))
         self.stretch: Tensor
         """Cells of each level across the unit cube, float32 of the levels."""
         self.resolution: Tensor
         """Vertices per side, int64 of the levels."""
         self.first_row: Tensor
         """Where each level begins in the table, int64 of the levels and one more."""
-        self.level_weight: Tensor
-        """What each level's features are multiplied by; a level of weight 0 costs nothing."""
 
 
 class HashGrid(nn.Module):
@@ -93,16 +90,7 @@ class HashGrid(nn.Module):
         self.lattice = Lattice(shape)
         # By numpy, which asks for large pages.
         self.table = nn.Parameter(torch.from_numpy(np.empty((sum(shape.rows), shape.features), np.float32)))
-        self.reset()
-
-    def reset(self) -> None:
-        """Draw the table anew, uniform in ±1e-4."""
         nn.init.uniform_(self.table, -1e-4, 1e-4)
-
-    def open_levels(self, count: float) -> None:
-        """Let the first ``count`` levels in, the last of them by its fraction, smoothly (BARF, Lin et al. 2021)."""
-        open_share = (count - torch.arange(self.shape.levels)).clamp(0, 1)
-        self.lattice.level_weight.copy_((1 - torch.cos(torch.pi * open_share)) / 2)
 
     def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
         """Features of points in [0, 1]³ (points outside are moved to the nearest face)."""
@@ -121,8 +109,7 @@ class HashGrid(nn.Module):
         """Through tiny-cuda-nn's own encoding, with our table in the place of its parameters."""
         encoding = _tcnn_encoding(self.shape)
         inside = point.clamp(0, 1) * self.shape.reach
-        encoded = torch.func.functional_call(encoding, {"params": self.table.flatten()}, (inside,))
-        return encoded * self.lattice.level_weight.repeat_interleave(self.shape.features)
+        return torch.func.functional_call(encoding, {"params": self.table.flatten()}, (inside,))
 
 
 def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
@@ -180,7 +167,7 @@ def encode_reference(
             offset = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2], device=point.device)
             weight = torch.where(offset > 0, fraction, 1 - fraction).prod(dim=-1, keepdim=True)
             total = total + weight * table[start + _row(cell + offset, vertices, end - start)].to(point.dtype)
-        levels.append(total * lattice.level_weight[level])
+        levels.append(total)
     return torch.cat(levels, dim=-1)
 
 

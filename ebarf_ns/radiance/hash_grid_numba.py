@@ -42,7 +42,7 @@ def encode(
     point: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], lattice: Lattice
 ) -> Float[Tensor, "points width"]:
     """Features of float32 points on a CPU, differentiable in points and table."""
-    levels = (lattice.stretch, lattice.resolution, lattice.first_row, lattice.level_weight)
+    levels = (lattice.stretch, lattice.resolution, lattice.first_row)
     encoded: Tensor = _Encoding.apply(point, table, *levels)  # pyright: ignore[reportAssignmentType]
     return encoded
 
@@ -131,19 +131,16 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
     """
 
     @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
-    def forward(point, table, stretch, resolution, first_row, level_weight, encoded):
+    def forward(point, table, stretch, resolution, first_row, encoded):
         levels, blocks = len(resolution), (len(point) + _BLOCK - 1) // _BLOCK
         touched = np.empty(levels * blocks, np.float32)
         for task in prange(levels * blocks):
             # All blocks of a level after one another, so that its rows stay in cache.
             level, block = _level(task // blocks, levels), task % blocks
             begin, end = block * _BLOCK, min(len(point), (block + 1) * _BLOCK)
-            vertices, scale, weight = resolution[level], stretch[level], level_weight[level]
+            vertices, scale = resolution[level], stretch[level]
             start, rows = first_row[level], first_row[level + 1] - first_row[level]
             first = level * features
-            if weight == 0:
-                encoded[begin:end, first : first + features] = 0
-                continue
             values = table[start : start + rows]
             if rows * features > _CACHED:
                 touched[task] = _touch(point, values, begin, end, scale, vertices, rows)
@@ -152,8 +149,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
                 iy, fy = _cell(point[i, 1], scale, vertices)
                 iz, fz = _cell(point[i, 2], scale, vertices)
                 r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(ix, iy, iz, vertices, rows)
-                gx, gy, gz = 1 - fx, 1 - fy, weight * (1 - fz)
-                fz = weight * fz
+                gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
                 w00, w10, w01, w11 = gx * gy, fx * gy, gx * fy, fx * fy
                 for f in range(features):
                     encoded[i, first + f] = gz * (
@@ -161,20 +157,17 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
                     ) + fz * (w00 * values[r4, f] + w10 * values[r5, f] + w01 * values[r6, f] + w11 * values[r7, f])
 
     @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
-    def backward(point, table, stretch, resolution, first_row, level_weight, gradient, table_gradient, point_gradient):
+    def backward(point, table, stretch, resolution, first_row, gradient, table_gradient, point_gradient):
         with_points = point_gradient.shape[1] > 0
         levels = len(resolution)
         touched = np.zeros(levels, np.float32)
         for k in prange(levels):
             level = _level(k, levels)
-            vertices, scale, weight = resolution[level], stretch[level], level_weight[level]
+            vertices, scale = resolution[level], stretch[level]
             start, rows = first_row[level], first_row[level + 1] - first_row[level]
             first = level * features
             values, sums = table[start : start + rows], table_gradient[start : start + rows]
             sums[:] = 0
-            if weight == 0:
-                point_gradient[level] = 0
-                continue
             for begin in range(0, len(point), _BLOCK):
                 end = min(len(point), begin + _BLOCK)
                 if rows * features > _CACHED:
@@ -189,7 +182,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
                     w00, w10, w01, w11 = gx * gy, fx * gy, gx * fy, fx * fy
                     a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = np.float32(0)
                     for f in range(features):
-                        g = weight * gradient[i, first + f]
+                        g = gradient[i, first + f]
                         a0 += g * values[r0, f]
                         a1 += g * values[r1, f]
                         a2 += g * values[r2, f]

@@ -28,7 +28,7 @@ def encode(
     point: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], lattice: Lattice
 ) -> Float[Tensor, "points width"]:
     """Features of float32 points on a GPU, differentiable in points and table."""
-    levels = (lattice.stretch, lattice.resolution, lattice.first_row, lattice.level_weight)
+    levels = (lattice.stretch, lattice.resolution, lattice.first_row)
     encoded: Tensor = _Encoding.apply(point, table, *levels)  # pyright: ignore[reportAssignmentType]
     return encoded
 
@@ -80,7 +80,7 @@ def _row(ix, iy, iz, vertices, rows):
 
 @triton.jit
 def _forward(
-    point, table, stretch, resolution, first_row, level_weight, encoded,
+    point, table, stretch, resolution, first_row, encoded,
     count, levels: tl.constexpr, features: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
@@ -89,9 +89,6 @@ def _forward(
     y = tl.load(point + 3 * i + 1, here, 0.0)
     z = tl.load(point + 3 * i + 2, here, 0.0)
     for level in range(levels):
-        weight = tl.load(level_weight + level)
-        # A closed level costs no look at the table.
-        seen = here & (tl.zeros((block,), tl.float32) + weight != 0)
         scale, vertices = tl.load(stretch + level), tl.load(resolution + level)
         start = tl.load(first_row + level)
         rows = tl.load(first_row + level + 1) - start
@@ -104,13 +101,13 @@ def _forward(
                 ox, oy, oz = corner & 1, (corner >> 1) & 1, corner >> 2
                 share = (fx if ox else 1 - fx) * (fy if oy else 1 - fy) * (fz if oz else 1 - fz)
                 row = start + _row(ix + ox, iy + oy, iz + oz, vertices, rows)
-                total += share * tl.load(table + row * features + f, seen, 0.0)
-            tl.store(encoded + i * (levels * features) + level * features + f, weight * total, here)
+                total += share * tl.load(table + row * features + f, here, 0.0)
+            tl.store(encoded + i * (levels * features) + level * features + f, total, here)
 
 
 @triton.jit
 def _backward(
-    point, table, stretch, resolution, first_row, level_weight, gradient, table_gradient, point_gradient,
+    point, table, stretch, resolution, first_row, gradient, table_gradient, point_gradient,
     count, levels: tl.constexpr, features: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
@@ -122,9 +119,6 @@ def _backward(
     gy = tl.zeros((block,), tl.float32)
     gz = tl.zeros((block,), tl.float32)
     for level in range(levels):
-        weight = tl.load(level_weight + level)
-        # A closed level costs no look at the table.
-        seen = here & (tl.zeros((block,), tl.float32) + weight != 0)
         scale, vertices = tl.load(stretch + level), tl.load(resolution + level)
         start = tl.load(first_row + level)
         rows = tl.load(first_row + level + 1) - start
@@ -137,9 +131,9 @@ def _backward(
             row = start + _row(ix + ox, iy + oy, iz + oz, vertices, rows)
             along = tl.zeros((block,), tl.float32)
             for f in tl.static_range(features):
-                g = weight * tl.load(gradient + i * (levels * features) + level * features + f, here, 0.0)
-                along += g * tl.load(table + row * features + f, seen, 0.0)
-                tl.atomic_add(table_gradient + row * features + f, wx * wy * wz * g, seen, sem="relaxed")
+                g = tl.load(gradient + i * (levels * features) + level * features + f, here, 0.0)
+                along += g * tl.load(table + row * features + f, here, 0.0)
+                tl.atomic_add(table_gradient + row * features + f, wx * wy * wz * g, here, sem="relaxed")
             gx += scale * along * wy * wz * (1.0 if ox else -1.0)
             gy += scale * along * wx * wz * (1.0 if oy else -1.0)
             gz += scale * along * wx * wy * (1.0 if oz else -1.0)

@@ -82,10 +82,6 @@ class DensityGrid(nn.Module):
         self.register_buffer("density", torch.ones(cells**3))
         self.density: Tensor
 
-    def reset(self) -> None:
-        """Back to knowing nothing."""
-        self.density.fill_(1.0)
-
     @torch.no_grad()
     def refresh(self, field: RadianceField, round_number: int, generator: torch.Generator) -> None:
         """Look up the field at a jittered place in every ``refresh_share``-th cell, other cells in each round."""

@@ -65,12 +65,6 @@ class Renderer(nn.Module):
         if self.density_grid and (step < _WARM_UP or step % _REFRESH_EVERY == 0):
             self.density_grid.refresh(self.field, step if step < _WARM_UP else step // _REFRESH_EVERY, random)
 
-    def reset(self) -> None:
-        """Forget everything learned."""
-        self.field.reset()
-        if self.density_grid:
-            self.density_grid.reset()
-
     def forward(self, rays: Rays, pairs_random: torch.Generator | None = None) -> Rendered:
         """What each ray sees; with ``pairs_random``, jittered, and ray k shares its samples with ray k + n/2.
 

@@ -21,7 +21,7 @@ def test_help_lists_the_commands():
 
 def test_inspect_for_people_and_for_programs(tiny_scene: Path):
     text = run_ok("ebarf", "inspect", tiny_scene)
-    assert "48 x 36" in text and "threshold loss" in text and "11 keyframes" in text
+    assert "48 x 36" in text and "ratio is corrected in training" in text and "11 keyframes" in text
     summary = json.loads(run_ok("ebarf", "inspect", tiny_scene, "--json"))
     assert summary["width"] == 48 and summary["events"] > 5000 and summary["end_us"] <= 500_000
     assert summary["events_within_trajectory"] == summary["events"]
@@ -60,7 +60,7 @@ def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):
     assert numbers["method"] == "ebarf" and numbers["step"] == 80
     page = Path(numbers["report"]).read_text()
     assert "data:image/png;base64," in page and "<svg" in page and "http" not in page.split("</style>")[0]
-    assert "pipeline.model.grid_levels" in page and "Eq. 5" in page
+    assert "pipeline.model.grid_levels" in page and "no contraction" in page
 
 
 def test_simulate_with_a_knob(tmp_path: Path):

@@ -12,6 +12,8 @@ import torch
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf import method
 from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig, GuardedOptimizers
+from ebarf_ns.simulation.sensor import SensorModel
+from ebarf_ns.simulation.simulate import Simulation, simulate
 
 
 def config(scene: Path, output: Path, name: str = "ebarf", steps: int = 12) -> EbarfTrainerConfig:
@@ -78,10 +80,29 @@ def test_wrong_ratio_of_the_thresholds_is_corrected(tiny_scene: Path, tmp_path: 
     assert text["contrast_threshold"]["on"] == text["contrast_threshold"]["off"]
     text["contrast_threshold"]["on"] *= 1.5
     (scene / "scene.json").write_text(json.dumps(text))
-    ready = trainer(config(scene, tmp_path, steps=100))
+    # It moves by at most 0.01 a step, and ever less: 100 steps end before it is there.
+    ready = trainer(config(scene, tmp_path, steps=200))
     ready.train()
     on, off, _ = ready.pipeline.model.sensor()
     assert float(on / off) == pytest.approx(1, abs=0.1)
+
+
+def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
+    sensor = SensorModel(threshold_on=0.4, threshold_off=0.25)
+    tiny = Simulation(duration_s=0.5, width=48, height=36, focal_px=41.0, frames=3, sensor=sensor)
+    known = simulate(tiny, tmp_path / "known")
+    unknown = shutil.copytree(known.folder, tmp_path / "unknown") / "scene.json"
+    unknown.write_text(json.dumps({**json.loads(unknown.read_text()), "contrast_threshold": None}))
+    ends = []
+    for scene in (known.folder, unknown.parent):
+        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=200))
+        ready.train()
+        on, off, _ = ready.pipeline.model.sensor()
+        assert float(on / off) == pytest.approx(1.6, rel=0.15)
+        ends.append(ready.pipeline.evaluate())
+    told, found = ends
+    assert found["psnr"] == pytest.approx(told["psnr"], abs=1.0)
+    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.1)
 
 
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
@@ -102,17 +123,9 @@ def test_seconds_end_a_run_and_drive_its_schedules(tiny_scene: Path, tmp_path: P
     ready = trainer(made)
     ready.train()
     assert ready.train_seconds >= 1.5 and ready.steps_done < 10**5
-    assert ready.progress() >= 1 and ready.field_restarted
+    assert ready.progress() >= 1
     rate = ready.optimizers.optimizers["fields"].param_groups[0]["lr"]
     assert rate < 0.3 * made.optimizers["fields"]["optimizer"].lr
-
-
-def test_under_frozen_poses_the_field_has_nothing_to_start_again_for(tiny_scene: Path, tmp_path: Path):
-    made = config(tiny_scene, tmp_path, steps=3)
-    made.pipeline.model.camera_optimizer.mode = "off"  # pyright: ignore[reportAttributeAccessIssue]
-    ready = trainer(made)
-    ready.train()
-    assert ready.steps_done == 3 and not ready.field_restarted
 
 
 def test_equal_seeds_give_equal_runs_and_others_do_not(tiny_scene: Path, tmp_path: Path):
@@ -194,9 +207,7 @@ def test_the_fast_paths_train_as_the_torch_reference_does(
 
     ends = []
     for name in ("kernels", "reference"):
-        made = config(tiny_scene, tmp_path / name, steps=60)
-        made.restart_field_at = 0.3
-        ready = trainer(made)
+        ready = trainer(config(tiny_scene, tmp_path / name, steps=60))
         if name == "reference":
             ready.pipeline.model.renderer.field.grid.carrier = "torch"
             monkeypatch.setattr(ray_sampling_numba, "importance_edges", ray_sampling.importance_edges)
@@ -207,18 +218,6 @@ def test_the_fast_paths_train_as_the_torch_reference_does(
     assert fast["psnr"] == pytest.approx(reference["psnr"], abs=0.3)
     assert fast["heldout_event_loss"] == pytest.approx(reference["heldout_event_loss"], rel=0.03)
     assert fast["ate_m"] == pytest.approx(reference["ate_m"], rel=0.02)
-
-
-def test_levels_come_in_over_the_fraction_asked_for(tiny_scene: Path, tmp_path: Path):
-    made = config(tiny_scene, tmp_path)
-    made.pipeline.model.all_levels_from = 0.5  # pyright: ignore[reportAttributeAccessIssue]
-    model = trainer(made).pipeline.model
-    weights = []
-    for progress in (0.0, 0.375, 0.5, 1.0):
-        model.follow_budget(progress)
-        weights.append(model.renderer.field.grid.lattice.level_weight.tolist())
-    assert weights[0] == [1, 1, 0, 0] and weights[2] == weights[3] == [1, 1, 1, 1]
-    assert weights[1][2] == 1 and 0.4 < weights[1][3] < 0.6
 
 
 @pytest.mark.parametrize(

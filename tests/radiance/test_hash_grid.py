@@ -73,22 +73,6 @@ def test_values_and_table_gradients_agree_on_borders_and_outside(carrier: Carrie
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
 
-@pytest.mark.parametrize("carrier", CARRIERS)
-def test_levels_come_in_by_their_weight_and_closed_ones_neither_give_nor_take(carrier: Carrier):
-    shape = SHAPES[0]
-    grid = made(shape, carrier)
-    grid.open_levels(2.5)
-    for ours, theirs in zip(*both(grid, random_points(500)), strict=True):
-        assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
-    values, table_gradient, _ = both(grid, random_points(500))[0]
-    assert (values[:, :4] != 0).all() and (values[:, 6:] == 0).all()
-    last = sum(shape.rows[:3])
-    assert table_gradient[:last].any() and not table_gradient[last:].any()
-    everything = made(shape, carrier)
-    half = values[:, 4:6] / everything(random_points(500))[:, 4:6]
-    assert torch.allclose(half, torch.full_like(half, 0.5), atol=1e-4)
-
-
 def test_gradients_that_are_still_held_are_never_written_over():
     grid, point = made(SHAPES[0], "numba"), random_points(200)
     first, second = (torch.autograd.grad(k * grid(point).sum(), grid.table)[0] for k in (1, 2))
@@ -196,7 +180,6 @@ def test_our_table_means_the_same_to_tiny_cuda_nn(shape: HashGridShape, monkeypa
     monkeypatch.setitem(sys.modules, "tinycudann", SimpleNamespace(Encoding=StandInEncoding))
     monkeypatch.setattr("ebarf_ns.radiance.hash_grid._encodings", {})
     grid = made(shape, "tcnn")
-    grid.open_levels(shape.levels - 0.5)
     for ours, theirs in zip(*both(grid, random_points(500)), strict=True):
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
@@ -209,7 +192,7 @@ def test_triton_kernels_through_the_interpreter():
     words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__, "-k", "triton"]
     inner = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert inner.returncode == 0, inner.stdout[-3000:] + inner.stderr[-2000:]
-    assert "10 passed" in inner.stdout
+    assert "9 passed" in inner.stdout
 
 
 @pytest.mark.skipif(INTERPRETED, reason="nothing is compiled where the interpreter runs")

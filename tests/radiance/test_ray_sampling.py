@@ -106,8 +106,6 @@ def test_density_grid_remembers_where_the_wall_is():
         grid.refresh(Slab(), k, generator)  # pyright: ignore[reportArgumentType]
     seen = grid.lookup(torch.tensor([[0.9, 0.1, -0.3], [-0.2, 0.5, 0.5]]))
     assert seen[0] > 10 and seen[1] < 1
-    grid.reset()
-    assert (grid.density == 1).all()
 
 
 @pytest.mark.parametrize("bounded", [True, False])
@@ -122,7 +120,9 @@ def test_density_grid_keeps_up_with_what_rays_come_across(bounded: bool):
 
 def test_only_rays_of_training_are_remembered():
     torch.manual_seed(0)
-    field = RadianceField(HashGridShape(4, 2, 4, 32, 10), bounded=True, density_bias=3.0)
+    field = RadianceField(HashGridShape(4, 2, 4, 32, 10), bounded=True)
+    with torch.no_grad():
+        field.trunk[-1].bias[0] = 3.0  # pyright: ignore[reportIndexIssue]
     renderer = Renderer(field, Sampling(samples=8, density_cells=16))
     rays = Rays(torch.zeros(4, 3), torch.nn.functional.normalize(torch.randn(4, 3), dim=-1))
     assert renderer.density_grid is not None
