@@ -183,7 +183,7 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
             "thresholds",
             f"on {threshold[0]}, off {threshold[1]}; their ratio is corrected in training"
             if threshold
-            else "unknown: their ratio is learned, and their scale matters little",
+            else "unknown: taken as equal, and their ratio is learned",
         ),
         (
             "distortion",

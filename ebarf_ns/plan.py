@@ -60,10 +60,10 @@ def plan_for(
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
-    smooth, distance = smoothed(trajectory), _distance(scene, trajectory)[0] if scene.bounds is not None else None
+    bounded = scene.bounds is not None
+    smooth, distance = smoothed(trajectory), _distance(scene, trajectory)[0] if bounded else None
     stride, straight = _stride(smooth, scene.camera.fx, distance)
     precision = fastest_precision(device)
-    bounded = scene.bounds is not None
     rays = 16384 if device == "cuda" else 1024
     return [
         Line(

@@ -22,7 +22,7 @@ from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
 from ebarf_ns.scene import ContrastThreshold, Scene
 
-# Log brightness is known up to a factor, so that the scale matters little: 0.1 or 0.6 for a 0.25 cost 1 to 2 dB.
+# Log brightness is known up to a factor, which the field can follow: 0.1 or 0.6 in place of 0.25 cost 1 to 2 dB.
 _UNKNOWN_THRESHOLDS = ContrastThreshold(0.25, 0.25)
 T = TypeVar("T")
 
