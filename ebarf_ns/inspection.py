@@ -10,13 +10,14 @@ from rich.table import Table
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
+from ebarf_ns.events.pairs import most_of_a_pixel
 from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.plan import Line, plan_for
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
-_HOT_RATIO = 50
 _FEW_EVENTS_PER_PIXEL = 5
 
 
@@ -35,6 +36,8 @@ class Summary:
     events_per_active_pixel: float
     busiest_pixel: tuple[int, int, int]
     """Column, row, events."""
+    hot_pixels: int
+    """Those that training leaves out for being far busier than usual."""
     keyframes: int
     trajectory_start_us: int
     trajectory_end_us: int
@@ -92,6 +95,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         silent_pixel_share=float((counts == 0).mean()),
         events_per_active_pixel=float(counts[counts > 0].mean()),
         busiest_pixel=(busiest % camera.width, busiest // camera.width, int(counts[busiest])),
+        hot_pixels=int((counts > most_of_a_pixel(counts)).sum()),
         keyframes=len(trajectory.t_us),
         trajectory_start_us=first_us,
         trajectory_end_us=last_us,
@@ -105,7 +109,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         frames=len(scene.frames),
         groundtruth=scene.groundtruth is not None,
         distortion=camera.model if any(camera.distortion) else "none",
-        plan=plan_for(scene, trajectory, events, "cuda" if torch.cuda.is_available() else "cpu"),
+        plan=plan_for(scene, smoothed(trajectory), events, "cuda" if torch.cuda.is_available() else "cpu"),
     )
 
 
@@ -118,10 +122,8 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
         found.append(
             f"{summary.brighter_share:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?"
         )
-    column, row, count = summary.busiest_pixel
-    if count > _HOT_RATIO * summary.events_per_active_pixel:
-        ratio = count / summary.events_per_active_pixel
-        found.append(f"pixel ({column}, {row}) has {count:,} events, {ratio:.0f} times the mean: hot?")
+    if summary.hot_pixels:
+        found.append(f"hot pixels, 10 times busier than usual and left out of training: {summary.hot_pixels:,}")
     if summary.events_per_active_pixel < _FEW_EVENTS_PER_PIXEL:
         found.append(
             f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"

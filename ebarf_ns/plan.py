@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_log, quat_wxyz_multiply, rotate
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate
 from ebarf_ns.radiance.field import fastest_precision
@@ -50,7 +49,7 @@ class Line:
 def plan_for(
     scene: Scene, trajectory: Trajectory, events: int, device: str, coarsest: int = 8, finest_given: int | None = None
 ) -> list[Line]:
-    """Decide for a scene with its initial trajectory and number of events, on "cpu" or "cuda".
+    """Decide for a scene, the trajectory that training begins from and a number of events, on "cpu" or "cuda".
 
     What is decided from the grid's coarsest and finest level follows those given, where they are.
     """
@@ -61,8 +60,8 @@ def plan_for(
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
     bounded = scene.bounds is not None
-    smooth, distance = smoothed(trajectory), _distance(scene, trajectory)[0] if bounded else None
-    stride, straight = _stride(smooth, scene.camera.fx, distance)
+    distance = _distance(scene, trajectory)[0] if bounded else None
+    stride, straight = _stride(trajectory, scene.camera.fx, distance)
     precision = fastest_precision(device)
     rays = 16384 if device == "cuda" else 1024
     return [
@@ -96,7 +95,7 @@ def plan_for(
             "this processor multiplies bfloat16 natively" if precision == "bfloat16" else "no native bfloat16 here",
         ),
         Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
-        Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(smooth, scene.camera.fx, distance)),
+        Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(trajectory, scene.camera.fx, distance)),
         Line(
             "pipeline.datamanager.train_num_rays_per_batch", rays, f"keeps {'a GPU' if rays > 1024 else 'caches'} full"
         ),
@@ -143,14 +142,15 @@ def _distance(scene: Scene, trajectory: Trajectory) -> tuple[float, float]:
     size = float((upper - lower).max())
     centre = (lower + upper) / 2
     place = (trajectory.poses.position.double() - centre) * 2 / size
-    inside = (place.abs() < 1).all(dim=-1).nonzero()[:, 0]
+    half_sides = (upper - lower) / size
+    inside = (place.abs() < half_sides).all(dim=-1).nonzero()[:, 0]
     if not len(inside):
         return size / 2, size
     some = inside[:: max(1, len(inside) // 50)]
     quat_wxyz = trajectory.poses.quat_wxyz[some].double()
     bearing = _some_bearings(scene).double()
     direction = rotate(quat_wxyz[:, None], bearing[None]).flatten(0, 1)
-    exits = leave_box(Rays(place[some].repeat_interleave(len(bearing), dim=0), direction))
+    exits = leave_box(Rays(place[some].repeat_interleave(len(bearing), dim=0), direction), half_sides)
     return max(float(exits.median()), 0.01) * size / 2, size
 
 
@@ -160,48 +160,48 @@ def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:
     return camera.bearings(torch.cartesian_prod(torch.from_numpy(columns), torch.from_numpy(rows)))
 
 
-def _stride(smooth: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
+def _stride(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
     """How far apart corrections are learned: as far as the motion between is straight to a 20th of a pixel."""
-    keyframes = len(smooth.t_us)
+    keyframes = len(trajectory.t_us)
     stride, off_px = 1, 0.0
     while 2 * stride * 4 <= keyframes:
-        wider = _off_straight_px(smooth, 2 * stride, focal_px, distance)
+        wider = _off_straight_px(trajectory, 2 * stride, focal_px, distance)
         if wider > _STRAIGHT_PX:
             break
         stride, off_px = 2 * stride, wider
-    rate = (keyframes - 1) / (float(smooth.t_us[-1] - smooth.t_us[0]) * 1e-6)
+    rate = (keyframes - 1) / (float(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6)
     if keyframes < 8:
         return 1, f"there are but {keyframes} keyframes"
     if stride == 1:
-        return 1, f"{rate:.0f} keyframes a second: further apart, motion or the noise left by smoothing is not straight"
+        return 1, f"{rate:.0f} keyframes a second: further apart, motion or the noise in it is not straight"
     return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
 
 
-def _interpolation(smooth: Trajectory, focal_px: float, distance: float | None) -> tuple[Interpolation, str]:
+def _interpolation(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[Interpolation, str]:
     """A spline where the motion between keyframes is no straight line, if they are spaced evenly enough for one."""
-    keyframes = len(smooth.t_us)
-    gaps_us = smooth.t_us.diff().double()
+    keyframes = len(trajectory.t_us)
+    gaps_us = trajectory.t_us.diff().double()
     uneven = float(gaps_us.max() / gaps_us.min())
     if keyframes < 5 or uneven > _UNEVEN:
         return "linear", f"{keyframes} keyframes, gaps between them up to {uneven:.3g} times the shortest: no spline"
     # Halving the distance between knots leaves a quarter of what is not straight.
-    off_px = _off_straight_px(smooth, 2, focal_px, distance) / 4
+    off_px = _off_straight_px(trajectory, 2, focal_px, distance) / 4
     if off_px < _AS_GOOD_AS_STRAIGHT_PX:
         return "linear", f"between keyframes the motion is straight to {off_px:.2g} px"
     return "cubic", f"between keyframes the motion is off a straight line by {off_px:.2g} px"
 
 
-def _off_straight_px(smooth: Trajectory, stride: int, focal_px: float, distance: float | None) -> float:
+def _off_straight_px(trajectory: Trajectory, stride: int, focal_px: float, distance: float | None) -> float:
     """How far keyframes are from the straight line between each ``stride``-th, root mean square, in pixels.
 
     Without a known distance, four times the trajectory's radius stands for it.
     """
-    knots = torch.arange(0, len(smooth.t_us) - 1, stride)
-    knots = torch.cat([knots, torch.tensor([len(smooth.t_us) - 1])])
-    line = interpolate(smooth.t_us[knots], Poses(*(column[knots] for column in smooth.poses)), smooth.t_us)
-    position = smooth.poses.position
+    knots = torch.arange(0, len(trajectory.t_us) - 1, stride)
+    knots = torch.cat([knots, torch.tensor([len(trajectory.t_us) - 1])])
+    line = interpolate(trajectory.t_us[knots], Poses(*(column[knots] for column in trajectory.poses)), trajectory.t_us)
+    position = trajectory.poses.position
     if distance is None:
         distance = 4 * float((position - position.mean(dim=0)).norm(dim=-1).max())
     moved = (line.position - position).norm(dim=-1) / max(distance, 1e-9)
-    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(line.quat_wxyz), smooth.poses.quat_wxyz))
+    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(line.quat_wxyz), trajectory.poses.quat_wxyz))
     return float((moved + turn.norm(dim=-1)).square().mean().sqrt()) * focal_px

@@ -45,6 +45,15 @@ def test_scale_of_the_world_changes_nothing(scene: Scene):
     assert planned(dataclasses.replace(scene, bounds=bounds), trajectory=large) == planned(scene)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_wall_is_as_near_as_the_bounds_say_in_its_direction(scene: Scene):
+    assert scene.bounds
+    (_, lower_y, lower_z), (_, upper_y, upper_z) = scene.bounds
+    corridor = dataclasses.replace(scene, bounds=((-10.0, lower_y, lower_z), (10.0, upper_y, upper_z)))
+    (line,) = (line for line in plan_for(corridor, read_tum(scene.trajectory), 10**9, "cpu") if "finest" in line.field)
+    assert "20 wide" in line.reason and "10 away" not in line.reason
+    assert line.value > 2 * planned(scene)["grid_finest"]
+
+
 def test_the_grid_is_no_finer_than_events_can_tell(scene: Scene):
     few = planned(dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=500.0)), events=10_000)
     assert few["grid_finest"] == 100 and few["grid_table_size_log2"] == 13

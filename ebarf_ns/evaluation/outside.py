@@ -18,7 +18,8 @@ _DARKEST = 1e-4
 def evaluate_files(scene: Scene, refined: Path, renders: Path | None) -> dict[str, Any]:
     """Errors of a trajectory and, where given, of pictures named like the scene's frames, by the rules of our own runs.
 
-    Pictures are linear in intensity. Raises :class:`EvaluationError`.
+    Pictures are linear in intensity; those of frames outside the trajectory's span count like the others. Raises
+    :class:`EvaluationError`.
     """
     results: dict[str, Any] = {}
     if scene.groundtruth:

@@ -102,6 +102,10 @@ class PairIndex:
         """Number of pixels that are left out for being far busier than usual."""
         return int(np.count_nonzero(np.diff(self.first)) - np.count_nonzero(self._less_events))
 
+    def with_hot_pixels(self) -> PairIndex:
+        """The same events, those of hot pixels counting like all others."""
+        return _counting(self.events, self.first, np.diff(self.first))
+
     @cached_property
     def refractory_us(self) -> int:
         """How long pixels are blind after an event, as the times between their events tell; 0 where they do not.
@@ -229,12 +233,15 @@ def index_pairs(
         for chunk in chunks():
             _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
         begin = end
-    counted = np.where(counts > _most_of_a_pixel(counts), 0, counts)
+    return _counting(events, first, np.where(counts > most_of_a_pixel(counts), 0, counts))
+
+
+def _counting(events: np.ndarray, first: np.ndarray, counted: np.ndarray) -> PairIndex:
     busiest = np.argsort(-counted, kind="stable")
     return PairIndex(events, first, busiest, np.r_[0, counted[busiest].cumsum()])
 
 
-def _most_of_a_pixel(counts: np.ndarray) -> int:
+def most_of_a_pixel(counts: Int64[np.ndarray, "pixels"]) -> int:
     """Events beyond which a pixel is hot: 10 times what the pixel of a usual event has."""
     falling = np.sort(counts)[::-1]
     # Hot pixels are few, and do not say what is usual.

@@ -84,6 +84,8 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
     refractory_us: int | None = None
     """How long a pixel is blind after an event; None: as the recording shows it, 0: not at all."""
+    leave_out_hot_pixels: bool = True
+    """Train without the pixels that have 10 times the events of usual ones."""
     heldout_share: float = 0.05
     """Share of the recording's time whose events are kept for heldout_event_loss."""
     index_memory_gib: float = 4.0
@@ -107,8 +109,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         if self.test_mode == "val":
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
             CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
-            if self.index.hot_pixels:
-                CONSOLE.print(f"left out {self.index.hot_pixels:,} hot pixels, 10 times busier than usual")
+            if self.hot_pixels_left_out:
+                CONSOLE.print(f"left out {self.hot_pixels_left_out:,} hot pixels, 10 times busier than usual")
             if self.refractory_us:
                 CONSOLE.print(f"pixels are blind for {self.refractory_us:,} us after an event")
 
@@ -149,6 +151,15 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             CONSOLE.print(f"left out {total - len(index.events):,} of {total:,} events, outside the trajectory's span")
         return index
 
+    @cached_property
+    def _training_index(self) -> PairIndex:
+        return self.index if self.config.leave_out_hot_pixels else self.index.with_hot_pixels()
+
+    @property
+    def hot_pixels_left_out(self) -> int:
+        """Number of pixels that are not trained on for being far busier than usual."""
+        return self._training_index.hot_pixels
+
     @property
     def _heldout_blocks(self) -> HeldoutBlocks:
         return HeldoutBlocks(*self.span_us, self.config.heldout_share)
@@ -161,14 +172,14 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     @cached_property
     def _training_batches(self) -> DrawAhead:
         # Before there are threads: each of them would make one of its own.
-        _ = self.index, self.refractory_us
+        _ = self._training_index, self.refractory_us
         ahead = 1 if torch.device(self.device).type == "cpu" else 4
         return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
 
     def _draw_training_pairs(self, batch: int) -> EventPairs:
         count = self.get_train_rays_per_batch() // 2
         random = batch_random(self.config.seed, batch)
-        pairs = self.index.draw_accepted(
+        pairs = self._training_index.draw_accepted(
             count, self.config.longest_pair, random, self._heldout_blocks.training, self.refractory_us
         )
         if len(pairs) < count:

@@ -27,10 +27,12 @@ _STAND_IN_VIEWS = 8
 
 
 class Normalization(NamedTuple):
-    """World to training coordinates: (point - centre) * scale, so that the scene fills [-1, 1]³."""
+    """World to training coordinates: (point - centre) * scale, so that the scene's longest side fills [-1, 1]."""
 
     centre: Float[Tensor, "3"]
     scale: float
+    half_sides: Float[Tensor, "3"]
+    """Of the scene, in training coordinates."""
 
     def apply(self, trajectory: Trajectory) -> Trajectory:
         """World poses to training coordinates, float32."""
@@ -67,6 +69,7 @@ class EbarfDataParser(DataParser):
             self.scene = read_scene(Path(config.data))
             self.trajectory = read_tum(self.scene.trajectory)
             self.normalization = _normalization(self.scene, self.trajectory)
+            self.mount_scale = self.normalization.scale / _reference_units(self.scene, self.trajectory)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: object) -> DataparserOutputs:
         keyframes = self.normalization.apply(self.trajectory)
@@ -75,12 +78,13 @@ class EbarfDataParser(DataParser):
         return DataparserOutputs(
             image_filenames=files,
             cameras=cameras,
-            scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]])),
+            scene_box=SceneBox(aabb=torch.stack([-self.normalization.half_sides, self.normalization.half_sides])),
             metadata={
                 "scene": self.scene,
                 "trajectory": self.trajectory,
                 "keyframes": keyframes,
                 "normalization": self.normalization,
+                "mount_scale": self.mount_scale,
             },
             dataparser_transform=torch.cat([torch.eye(3), translation.float()], dim=1),
             dataparser_scale=self.normalization.scale,
@@ -99,17 +103,35 @@ class EbarfDataParser(DataParser):
         if not frames:
             return self._keyframe_views(keyframes, max(1, len(keyframes.t_us) // _STAND_IN_VIEWS))
         event_camera = Trajectory(times[inside], interpolate(keyframes.t_us, keyframes.poses, times[inside]))
-        return frame_cameras(frames, event_camera, self.normalization.scale), [frame.path for frame in frames]
+        return frame_cameras(frames, event_camera, self.mount_scale), [frame.path for frame in frames]
 
 
 def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:
     check_bounds(scene, trajectory)
     if scene.bounds is not None:
         lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
-        return Normalization((lower + upper) / 2, 2 / float((upper - lower).max()))
+        longest = (upper - lower).max()
+        return Normalization((lower + upper) / 2, 2 / float(longest), ((upper - lower) / longest).float())
     centre = trajectory.poses.position.mean(dim=0)
     radius = float((trajectory.poses.position - centre).norm(dim=-1).max())
-    return Normalization(centre, _TRAJECTORY_SHARE / radius if radius > 0 else 1.0)
+    return Normalization(centre, _TRAJECTORY_SHARE / radius if radius > 0 else 1.0, torch.ones(3))
+
+
+def _reference_units(scene: Scene, trajectory: Trajectory) -> float:
+    """The trajectory's unit in the reference's, which is that of a rig's calibration; 1 where nobody knows or asks.
+
+    A trajectory's scale is free, and one camera beside another shows where a frame was taken in metres.
+    """
+    if scene.groundtruth is None or not any(_apart(frame) for frame in scene.frames):
+        return 1.0
+    from ebarf_ns.evaluation.trajectory_error import trajectory_results
+
+    results = trajectory_results(trajectory, read_tum(scene.groundtruth))
+    return results["scale"] or results["scale_orientation"] or 1.0
+
+
+def _apart(frame: Frame) -> bool:
+    return any(row[3] for row in frame.event_camera_from_frame_camera[:3])
 
 
 _OPENGL_FROM_OPENCV = torch.tensor([1.0, -1.0, -1.0, 1.0])
@@ -120,12 +142,13 @@ def opengl_from_opencv(camera_to_world: Float[Tensor, "*batch 3 4"]) -> Float[Te
     return camera_to_world * _OPENGL_FROM_OPENCV.to(camera_to_world)
 
 
-def frame_cameras(frames: list[Frame], event_camera: Trajectory, scale: float) -> Cameras:
-    """The cameras of frames, given the event camera's pose in training coordinates at each frame's time."""
+def frame_cameras(frames: list[Frame], event_camera: Trajectory, mount_scale: float) -> Cameras:
+    """The cameras of frames, given the event camera's pose in training coordinates at each frame's time, and a unit of
+    the rig's calibration in training coordinates."""
     mount = torch.tensor([frame.event_camera_from_frame_camera for frame in frames])
     pose = event_camera.poses.matrix()
     rotation = pose[:, :, :3] @ mount[:, :3, :3]
-    position = pose[:, :, :3] @ (scale * mount[:, :3, 3:]) + pose[:, :, 3:]
+    position = pose[:, :, :3] @ (mount_scale * mount[:, :3, 3:]) + pose[:, :, 3:]
     return _nerfstudio_cameras(
         [frame.camera for frame in frames], event_camera.t_us, torch.cat([rotation, position], dim=-1)
     )

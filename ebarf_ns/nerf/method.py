@@ -24,7 +24,7 @@ def _trainer(
     return EbarfTrainerConfig(
         method_name=method_name,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
-        max_num_iterations=6000,
+        max_num_iterations=30_000,
         # Evaluation goes by the budget, see EbarfTrainerConfig.evaluations.
         steps_per_eval_batch=10**9,
         steps_per_eval_image=10**9,

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
@@ -39,6 +40,11 @@ class EbarfModelConfig(ModelConfig):
     """An event-loss NeRF that corrects its own trajectory."""
 
     _target: type = field(default_factory=lambda: EbarfModel)
+    # nerfstudio's, of which nothing here makes use: no flags that would do nothing.
+    enable_collider: tyro.conf.Suppress[bool] = False
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    prompt: tyro.conf.Suppress[str | None] = None
     eval_num_rays_per_chunk: int = 4096
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
     loss: Literal["threshold", "normalized"] = "threshold"
@@ -122,7 +128,7 @@ class EbarfModel(Model):
             config.most_hidden,
             _planned(config.density_cells),
         )
-        self.renderer = Renderer(field, sampling)
+        self.renderer = Renderer(field, sampling, self.scene_box.aabb[1])
         self.camera_optimizer: TrajectoryOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data,
             device="cpu",

@@ -71,6 +71,10 @@ class EbarfPipeline(VanillaPipeline):
     def _normalization(self) -> Normalization:
         return self.datamanager.train_dataset.metadata["normalization"]
 
+    @property
+    def _mount_scale(self) -> float:
+        return self.datamanager.train_dataset.metadata["mount_scale"]
+
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
         self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.rank)
@@ -111,7 +115,7 @@ class EbarfPipeline(VanillaPipeline):
 
     def _image_errors(self, renders: Path | None, scale_to_reference: float | None) -> dict[str, float | None]:
         """Frames at the refined pose of their time, and apart from them those outside the trajectory's span."""
-        optimizer, scale = self.model.camera_optimizer, self._normalization.scale
+        optimizer = self.model.camera_optimizer
         keyframe_t_us = optimizer.keyframe_t_us.cpu()
         within, outside = [], []
         for frame in self.scene.frames:
@@ -123,7 +127,7 @@ class EbarfPipeline(VanillaPipeline):
             initial = Poses(*(column.cpu() for column in optimizer.initial()))
             # Placed along the initial trajectory, from where the model moves them along with the refined one.
             poses = interpolate(keyframe_t_us, initial, t_us)
-            cameras = frame_cameras(within, Trajectory(t_us, poses), scale)
+            cameras = frame_cameras(within, Trajectory(t_us, poses), self._mount_scale)
             results |= self._compare(within, cameras, scale_to_reference, renders)
         if outside:
             results |= {"frames_outside_span": float(len(outside))}
@@ -143,7 +147,7 @@ class EbarfPipeline(VanillaPipeline):
         except EvaluationError:
             return None
         placed = self._normalization.apply(Trajectory(t_us, poses))
-        cameras = frame_cameras(frames, placed, self._normalization.scale)
+        cameras = frame_cameras(frames, placed, self._mount_scale)
         # Without their times, cameras are not moved along with the refined trajectory.
         cameras.metadata = {}
         return cameras

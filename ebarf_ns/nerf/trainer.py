@@ -39,13 +39,24 @@ _LEAST = {
     "pipeline.datamanager.train_num_rays_per_batch": 2,
     "pipeline.datamanager.eval_num_rays_per_batch": 2,
     "pipeline.datamanager.longest_pair": 1,
+    "pipeline.datamanager.refractory_us": 0,
+    "pipeline.datamanager.heldout_share": 0,
     "pipeline.datamanager.index_memory_gib": 1e-6,
+    "pipeline.model.grid_levels": 1,
+    "pipeline.model.grid_features": 1,
     "pipeline.model.grid_coarsest": 2,
+    "pipeline.model.grid_finest": 2,
+    "pipeline.model.grid_table_size_log2": 1,
+    "pipeline.model.density_cells": 1,
+    "pipeline.model.coarse_samples": 1,
+    "pipeline.model.uniform_share": 0,
     "pipeline.model.most_hidden": 1e-6,
     "pipeline.model.outliers_from": 1e-3,
     "pipeline.model.render_variance": 0,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
+    "pipeline.model.camera_optimizer.keyframe_stride": 1,
+    "pipeline.model.camera_optimizer.prior": 0,
 }
 
 
@@ -128,7 +139,8 @@ class EbarfTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: EbarfTrainer)
     max_train_seconds: float | None = None
-    """End after this many seconds of training, evaluation and loading excluded; all schedules follow."""
+    """End after this many seconds of training, evaluation and loading excluded, if not after --max-num-iterations
+    steps before; all schedules follow."""
     evaluations: int = 8
     """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
 
@@ -176,20 +188,20 @@ class EbarfTrainer(Trainer):
         events, _, _ = RecordingFile(scene.events, scene.camera.width, scene.camera.height).span()
         device = "cuda" if self.device.startswith("cuda") else "cpu"
         model: Any = self.config.pipeline.model
-        lines = plan_for(scene, trajectory, events, device, model.grid_coarsest, model.grid_finest)
+        start = model.camera_optimizer.start(trajectory)
+        lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest)
         self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
         self._keep_plan()
 
     def _lines_of_resumed_run(self, lines: list[Line]) -> list[Line]:
         """The plan that a loaded checkpoint was made by, whatever would be planned on this machine today."""
         loaded = self._loaded_path()
-        kept = loaded.parent.parent / "config.yml" if loaded else None
+        kept = loaded.parent.parent / "metrics.jsonl" if loaded else None
         if kept is None or not kept.is_file():
             return lines
-        before = yaml.load(kept.read_text(encoding="utf-8"), Loader=yaml.Loader)
-        values = [reduce(lambda part, name: getattr(part, name, None), line.field.split("."), before) for line in lines]
-        pairs = zip(lines, values, strict=True)
-        return [line if value is None else Line(line.field, value, "as in the run resumed") for line, value in pairs]
+        before = json.loads(kept.read_text(encoding="utf-8").splitlines()[0]).get("plan", {})
+        resumed = [Line(field, made["value"], "as in the run resumed") for field, made in before.items()]
+        return [next((line for line in resumed if line.field == planned.field), planned) for planned in lines]
 
     @check_main_thread
     def _keep_plan(self) -> None:
@@ -278,9 +290,13 @@ class EbarfTrainer(Trainer):
         """Initial trajectory and header first; a run that goes on in its own folder keeps what is there."""
         write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
         path = self.base_dir / "metrics.jsonl"
-        if self._start_step == 0 or not path.is_file():
-            with whole_file(path) as temporary:
-                temporary.write_text(json.dumps(self._header()) + "\n", encoding="utf-8")
+        lines = [json.dumps(self._header())]
+        if self._start_step and path.is_file():
+            header, *records = path.read_text(encoding="utf-8").splitlines()
+            # What was evaluated after the checkpoint will be again.
+            lines = [header, *(record for record in records if json.loads(record)["step"] <= self._start_step)]
+        with whole_file(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     @check_main_thread
     def _record_metrics(self, record: dict[str, Any]) -> None:
@@ -304,6 +320,8 @@ class EbarfTrainer(Trainer):
             "scene_digest": _digest((scene.folder / "scene.json").read_bytes() + scene.trajectory.read_bytes()),
             "config_digest": _digest(yaml.dump(configuration).encode()),
             "hash_grid": fastest_carrier(torch.zeros(0, 3, device=self.device)),
+            "blind_us": self.pipeline.datamanager.refractory_us,
+            "hot_pixels_left_out": self.pipeline.datamanager.hot_pixels_left_out,
             "plan": {line.field: {"value": line.value, "reason": line.reason} for line in self.plan},
         }
 
@@ -356,8 +374,12 @@ class EbarfTrainer(Trainer):
             step = self.config.load_step
             if step is None and not steps:
                 raise TrainingError(f"{self.config.load_dir}: holds no step-*.ckpt, expected a run's checkpoints")
-            return self.config.load_dir / f"step-{step:09d}.ckpt" if step is not None else steps[-1]
-        return self.config.load_checkpoint
+            path = self.config.load_dir / f"step-{step:09d}.ckpt" if step is not None else steps[-1]
+        else:
+            path = self.config.load_checkpoint
+        if path is not None and not path.is_file():
+            raise TrainingError(f"{path}: is no file, expected a run's checkpoint")
+        return path
 
 
 def _digest(content: bytes) -> str:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+import tyro
 from jaxtyping import Float, Int
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
@@ -11,7 +12,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
 from ebarf_ns.geometry.smoothing import smoothed
-from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
+from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix, rotate
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate, intervals
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
 
@@ -25,15 +26,23 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     _target: type = field(default_factory=lambda: TrajectoryOptimizer)
     mode: Literal["refine", "off"] = "refine"  # pyright: ignore[reportIncompatibleVariableOverride]
     """Refine every keyframe, or keep the trajectory as it came."""
+    # nerfstudio's penalties do not go with keyframes; here there is the prior.
+    trans_l2_penalty: tyro.conf.Suppress[float] = 0.0
+    rot_l2_penalty: tyro.conf.Suppress[float] = 0.0
     smooth: bool = True
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
     prior: float = 0.005
-    """How much the trajectory as it came counts beside the events, all of which count as 1; 0: not at all."""
+    """How much the trajectory that training begins from counts beside the events, all of which count as 1; 0: not at
+    all."""
     interpolation: Interpolation | None = None
     """Between keyframes: straight and at constant velocity (Eq. 3), or with velocities that run on through the
     keyframes; None: as planned."""
+
+    def start(self, keyframes: Trajectory) -> Trajectory:
+        """Where training begins from."""
+        return smoothed(keyframes) if self.smooth and self.mode == "refine" else keyframes
 
 
 class TrajectoryOptimizer(CameraOptimizer):
@@ -64,7 +73,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.keyframe_t_us: Tensor
         self.initial_position: Tensor
         self.initial_quat_wxyz: Tensor
-        start = smoothed(keyframes).poses if config.smooth and config.mode == "refine" else keyframes.poses
+        start = config.start(keyframes).poses
         self.register_buffer("start_position", start.position.clone())
         self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
         self.start_position: Tensor
@@ -108,8 +117,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         t_us = (raybundle.metadata or {}).pop("event_t_us", None)
         if t_us is not None:
             poses = self.poses_at(t_us[..., 0])
-            rotation = quat_wxyz_to_matrix(poses.quat_wxyz)
-            raybundle.directions = (rotation @ raybundle.directions[..., None])[..., 0]
+            raybundle.directions = rotate(poses.quat_wxyz, raybundle.directions)
             raybundle.origins = poses.position
 
     def forward(self, indices: Int[Tensor, "cameras"]) -> Float[Tensor, "cameras 3 4"]:
@@ -139,7 +147,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         return opengl_from_opencv(moved).to(camera_to_world)
 
     def get_loss_dict(self, loss_dict: dict) -> None:
-        """Adds what speaks for the trajectory as it came: it is off by some pixels, but nobody knows by how many.
+        """Adds what speaks for the trajectory at the start: it is off by some pixels, but nobody knows by how many.
 
         If that number may be of any size, from a tenth of a pixel on, corrections c cost log(1 + mean |c|² / 0.1²):
         large ones next to nothing, while a good trajectory stays where a field that is yet to take shape would bend

@@ -20,7 +20,7 @@ _DARKEST = 1e-3
 def lin_log(intensity: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Eq. 2 with B = 20 on 255 times the intensity: linear below the knee, logarithmic above.
 
-    Its slope is at most 255/20 (just above the knee); at 0 it is 255 ln(20)/20.
+    Its slope is 255 ln(20)/20 below the knee, and at most 255/20 above.
     """
     value = intensity * _EIGHT_BIT
     linear = value < LIN_LOG_KNEE

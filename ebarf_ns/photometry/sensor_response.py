@@ -15,7 +15,7 @@ class Response(NamedTuple):
     threshold_on: Tensor | float
     threshold_off: Tensor | float
     leak_hz: Tensor | float
-    """Events a second that report "brighter" where nothing changes."""
+    """Events a second that report "brighter" where nothing changes; "darker" where negative."""
 
 
 class SensorResponse(nn.Module):
@@ -27,7 +27,7 @@ class SensorResponse(nn.Module):
 
     Neither may explain a recording away: where all events are of one polarity, a constant image would do if their
     threshold were 0, or if all were leaks. The ratio stays within a third and three times the nominal one, and the
-    leak below one event a second.
+    leak within one event a second.
     """
 
     def __init__(self, threshold_on: float, threshold_off: float, learned: bool = True):

@@ -45,7 +45,7 @@ class RadianceField(nn.Module):
 
     ``bounded``: the scene lies in [-1, 1]³; else space is contracted. ``intensity_range``: ``unit`` is a sigmoid
     (the reference implementation's), ``positive`` an exponential, for scenes of any dynamic range. ``precision`` is
-    that of the MLPs' products; sums and everything else are float32.
+    that of the MLPs' inputs, weights and outputs; their parameters, sums and everything else are float32.
     """
 
     def __init__(

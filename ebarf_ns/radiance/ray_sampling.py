@@ -33,10 +33,10 @@ class Rendered(NamedTuple):
     """Share of the light that comes from within the scene."""
 
 
-def leave_box(rays: Rays, half_side: float = 1.0) -> Float[Tensor, "rays"]:
-    """Distance at which each ray leaves the cube [-h, h]³ (its far side, also for origins outside)."""
+def leave_box(rays: Rays, half_sides: Float[Tensor, "3"]) -> Float[Tensor, "rays"]:
+    """Distance at which each ray leaves the box [-h, h] (its far side, also for origins outside)."""
     away = torch.where(rays.direction.abs() < 1e-9, torch.full_like(rays.direction, 1e-9), rays.direction)
-    return torch.maximum((half_side - rays.origin) / away, (-half_side - rays.origin) / away).amin(-1)
+    return torch.maximum((half_sides - rays.origin) / away, (-half_sides - rays.origin) / away).amin(-1)
 
 
 def coarse_edges(near: float, far: Float[Tensor, "rays"], count: int, bounded: bool) -> Float[Tensor, "rays count+1"]:

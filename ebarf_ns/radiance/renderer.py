@@ -51,11 +51,16 @@ class Sampling:
 
 
 class Renderer(nn.Module):
-    """A field, and with importance sampling a memory of where it is dense, so that empty space costs little."""
+    """A field, and with importance sampling a memory of where it is dense, so that empty space costs little.
 
-    def __init__(self, field: RadianceField, sampling: Sampling):
+    A bounded scene lies in the box [-h, h], h the ``half_sides``.
+    """
+
+    def __init__(self, field: RadianceField, sampling: Sampling, half_sides: Float[Tensor, "3"] | None = None):
         super().__init__()
         self.field, self.sampling = field, sampling
+        self.register_buffer("half_sides", torch.ones(3) if half_sides is None else half_sides, persistent=False)
+        self.half_sides: Tensor
         self.density_grid = (
             DensityGrid(sampling.density_cells, field.bounded) if sampling.kind == "importance" else None
         )
@@ -78,7 +83,7 @@ class Renderer(nn.Module):
     def sample_edges(self, rays: Rays, pairs_random: torch.Generator | None) -> Float[Tensor, "rays samples+1"]:
         """Edges of the intervals whose middles are asked for."""
         sampling, bounded = self.sampling, self.field.bounded
-        far = leave_box(rays) if bounded else torch.full_like(rays.origin[:, 0], _FAR_UNBOUNDED)
+        far = leave_box(rays, self.half_sides) if bounded else torch.full_like(rays.origin[:, 0], _FAR_UNBOUNDED)
         jitter = torch.zeros(len(far), 1, device=far.device)
         if pairs_random:
             far = far.view(2, -1).amax(0).repeat(2)

@@ -32,10 +32,15 @@ def test_inspect_points_at_what_is_wrong(tiny_scene: Path, tmp_path: Path):
     with h5py.File(scene / "events.h5", "r+") as file:
         polarity = np.asarray(file["events/p"])
         file["events/p"][...] = np.ones_like(polarity)  # pyright: ignore[reportIndexIssue]
+        for name in ("x", "y"):
+            column = np.asarray(file[f"events/{name}"])
+            column[::2] = 3
+            file[f"events/{name}"][...] = column  # pyright: ignore[reportIndexIssue]
     lines = (scene / "trajectory.txt").read_text().splitlines()
     (scene / "trajectory.txt").write_text("\n".join(lines[:7]))
     text = run_ok("ebarf", "inspect", scene)
     assert "100% of the events are brighter" in text and "outside the trajectory's span" in text
+    assert "left out of training: 1" in text
 
 
 def test_trajectory_compare_prints_one_object(tiny_scene: Path):

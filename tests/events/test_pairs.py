@@ -186,6 +186,19 @@ def test_edges_that_have_nearly_all_events_count_in_full():
     assert index.max_steps == 999 and index.events_before[-1] == len(pixel)
 
 
+def test_a_hot_pixel_counts_for_nothing_unless_asked_for():
+    random = np.random.default_rng(0)
+    pixel = random.permutation(np.r_[np.repeat(np.arange(100), 30), np.full(1000, 100)])
+    x, zeros = pixel.astype(np.uint16), np.zeros(len(pixel), np.uint16)
+    t_us = np.sort(random.integers(0, 10**6, len(pixel)))
+    index = index_pairs(lambda: [Recording(x, zeros, t_us, np.ones(len(pixel), np.int8))], 200, 1)
+    every = index.with_hot_pixels()
+    assert index.hot_pixels == 1 and every.hot_pixels == 0
+    assert index.events_before[-1] == 3000 and every.events_before[-1] == 4000
+    drawn = [which.draw(np.full(1000, 1), np.random.default_rng(0)) for which in (index, every)]
+    assert [(pairs.pixel == 100).any() for pairs in drawn] == [False, True]
+
+
 def spaced(intervals_us: np.ndarray) -> PairIndex:
     """Brighter events of one pixel with these times between them."""
     t_us = np.r_[0, np.cumsum(intervals_us)].astype(np.int64)

@@ -37,8 +37,10 @@ def along_x(count: int = 1) -> Rays:
 
 def test_rays_leave_the_box_where_they_should():
     direction = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [1, 1, 0], [0, 0, -1]]), dim=-1)
-    far = leave_box(Rays(torch.tensor([[0.5, 0, 0], [0, 0, 0], [0, 0, 0.25]]), direction))
-    assert torch.allclose(far, torch.tensor([0.5, math.sqrt(2), 1.25]))
+    rays = Rays(torch.tensor([[0.5, 0, 0], [0, 0, 0], [0, 0, 0.25]]), direction)
+    assert torch.allclose(leave_box(rays, torch.ones(3)), torch.tensor([0.5, math.sqrt(2), 1.25]))
+    flat = torch.tensor([1.0, 0.5, 0.3])
+    assert torch.allclose(leave_box(rays, flat), torch.tensor([0.5, 0.5 * math.sqrt(2), 0.55]))
 
 
 @pytest.mark.parametrize("bounded", [True, False])
@@ -143,7 +145,7 @@ def test_gradient_moves_the_ray_towards_the_light():
     torch.nn.init.normal_(field.grid.table)
     origin = torch.zeros(2, 3, requires_grad=True)
     rays = Rays(origin, torch.nn.functional.normalize(torch.ones(2, 3), dim=-1))
-    rendered = composite(field, rays, coarse_edges(0.05, leave_box(rays), 16, True), 0.5)
+    rendered = composite(field, rays, coarse_edges(0.05, leave_box(rays, torch.ones(3)), 16, True), 0.5)
     (gradient,) = torch.autograd.grad(rendered.intensity.sum(), origin)
     assert torch.isfinite(gradient).all() and gradient.abs().sum() > 0
 
@@ -155,7 +157,7 @@ def test_samples_placed_in_one_pass_are_those_of_the_reference(bounded: bool, pa
     grid = DensityGrid(16, bounded)
     grid.density.copy_(torch.rand(16**3) ** 6 * 50)
     rays = Rays(torch.rand(40, 3) - 0.5, torch.nn.functional.normalize(torch.randn(40, 3), dim=-1))
-    far = leave_box(rays) if bounded else torch.full((40,), 50.0)
+    far = leave_box(rays, torch.ones(3)) if bounded else torch.full((40,), 50.0)
     far[3] = far[23] = 0.0
     jitter = torch.rand(40, 1) - 0.5
     if pairs:
@@ -176,8 +178,9 @@ def test_the_wall_behind_a_cell_that_a_ray_may_only_graze_is_looked_at_too(place
     grid.density[cells] = 1e4
     rays = Rays(torch.full((1, 3), 0.01), torch.tensor([[1.0, 0, 0]]))
     seen = []
+    far = leave_box(rays, torch.ones(3))
     for most_hidden in (0.3, 1.0):
-        edges = place(grid, rays, 0.05, leave_box(rays), 16, 0.1, most_hidden, 16, torch.zeros(1, 1), False)
+        edges = place(grid, rays, 0.05, far, 16, 0.1, most_hidden, 16, torch.zeros(1, 1), False)
         middle = (edges[0, 1:] + edges[0, :-1]) / 2
         assert ((middle > 0.2) & (middle < 0.4)).sum() >= 4
         seen.append(int((middle > 0.86).sum()))

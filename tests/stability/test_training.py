@@ -295,8 +295,14 @@ def test_a_hot_pixel_with_a_million_events(small_scene: Path, tmp_path: Path):
         return Recording(x, y, t_us[order], polarity)
 
     clean = trained(small_scene, tmp_path / "clean")
-    hot = trained(variant(small_scene, tmp_path / "scene", events=with_hot_pixel), tmp_path / "hot")
+    scene = variant(small_scene, tmp_path / "scene", events=with_hot_pixel)
+    hot = trained(scene, tmp_path / "hot")
     assert hot["rotation_deg"] < 1.3 * clean["rotation_deg"] and hot["psnr"] > clean["psnr"] - 2
+    header = json.loads((tmp_path / "hot/x/ebarf/run/metrics.jsonl").read_text().splitlines()[0])
+    assert header["hot_pixels_left_out"] == 1
+    made = config(scene, tmp_path / "kept", steps=1)
+    made.pipeline.datamanager.leave_out_hot_pixels = False  # pyright: ignore[reportAttributeAccessIssue]
+    assert trainer(made).pipeline.datamanager.hot_pixels_left_out == 0
 
 
 def test_all_polarities_equal(small_scene: Path, tmp_path: Path):
