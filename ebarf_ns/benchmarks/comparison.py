@@ -69,12 +69,15 @@ def run_comparison(
         progress(done, len(todo), f"{job.method}, {job.scene}, {job.trajectory}, seed {job.seed}, {job.seconds:g} s")
         records.append(_result(manifest, job, folder))
     progress(len(todo), len(todo), "")
+    # A comparison that was stopped may have gone on another day, and elsewhere.
+    measured = [record.pop("measured") for record in records]
+    when, where, torch_version = (", ".join(sorted({one[what] for one in measured})) for what in _measured())
     records += [_joined(manifest, other, folder) for other in manifest.others]
     result = {
         "name": manifest.name,
-        "date": date.today().isoformat(),
-        "machine": machine(),
-        "versions": {"torch": torch.__version__},
+        "date": when,
+        "machine": where,
+        "versions": {"torch": torch_version},
         "roles": {name: method.role for name, method in manifest.methods.items()},
         "records": records,
     }
@@ -84,12 +87,12 @@ def run_comparison(
 
 
 def _result(manifest: Manifest, job: Job, folder: Path) -> dict[str, Any]:
-    scene, method = _scene(manifest, job, folder), manifest.methods[job.method]
-    name = job.name(scene.name, method, manifest.evaluations)
+    (scene, made_of), method = _scene(manifest, job, folder), manifest.methods[job.method]
+    name = job.name(made_of, method, manifest.evaluations)
     path = folder / "results" / f"{name}.json"
     if path.is_file():
         return json.loads(path.read_text(encoding="utf-8"))
-    record = {**vars(job), "initial": _initial_errors(read_scene(scene)), "evaluations": []}
+    record = {**vars(job), "measured": _measured(), "initial": _initial_errors(read_scene(scene)), "evaluations": []}
     run = folder / "runs" / name / method.words[0] / "run"
     shutil.rmtree(folder / "runs" / name, ignore_errors=True)
     try:
@@ -101,8 +104,13 @@ def _result(manifest: Manifest, job: Job, folder: Path) -> dict[str, Any]:
     return record
 
 
-def _scene(manifest: Manifest, job: Job, folder: Path) -> Path:
-    """The scene folder that a training gets: as simulated or as given, with the trajectory that it shall have."""
+def _measured() -> dict[str, str]:
+    return {"date": date.today().isoformat(), "machine": machine(), "torch": torch.__version__}
+
+
+def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
+    """The scene folder that a training gets, as simulated or as given, with the trajectory that it shall have; and what
+    that was made of."""
     source = manifest.scenes[job.scene]
     if not isinstance(source, Path):
         simulation = replace(source, seed=job.seed)
@@ -110,11 +118,11 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> Path:
         if not (source / "scene.json").is_file():
             simulate(simulation, source)
     errors = NO_ERRORS if job.trajectory == TRUE else manifest.trajectories[job.trajectory]
-    if errors is None:
-        return source
     scene = read_scene(source)
-    contents = [path.read_bytes() for path in (source / "scene.json", scene.trajectory, scene.groundtruth) if path]
-    made = folder / "scenes" / _named(f"{job.scene}-{job.seed}-{job.trajectory}", errors, job.seed, contents)
+    made_of = _contents(scene), errors
+    if errors is None:
+        return source, made_of
+    made = folder / "scenes" / _named(f"{job.scene}-{job.seed}-{job.trajectory}", made_of, job.seed)
     if not (made / "scene.json").is_file():
         with whole_folder(made) as temporary:
             # Everything else stays where it is.
@@ -122,7 +130,14 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> Path:
             write_tum(trajectory, perturb(_true_keyframes(scene), errors, job.seed))
             lower_upper = scene.bounds and tuple(tuple(errors.scale * one for one in corner) for corner in scene.bounds)
             write_scene(replace(scene, folder=temporary, trajectory=trajectory, bounds=lower_upper or None))
-    return made
+    return made, made_of
+
+
+def _contents(scene: Scene) -> object:
+    """What tells a scene from another one of its name; of large files, their sizes."""
+    small = (scene.folder / "scene.json", scene.trajectory, scene.groundtruth)
+    large = (scene.events, *(frame.path for frame in scene.frames))
+    return [path.read_bytes() for path in small if path], [path.stat().st_size for path in large if path.is_file()]
 
 
 def _true_keyframes(scene: Scene) -> Trajectory:
@@ -140,6 +155,7 @@ def _initial_errors(scene: Scene) -> dict[str, float | None]:
 def _joined(manifest: Manifest, other: Other, folder: Path) -> dict[str, Any]:
     """What another program reached, from its files."""
     job = Job(other.method, other.scene, other.trajectory, other.seed, float(other.seconds))
-    scene = read_scene(_scene(manifest, job, folder))
+    folder_of_scene, _ = _scene(manifest, job, folder)
+    scene = read_scene(folder_of_scene)
     evaluation = {"train_seconds": job.seconds, **evaluate_files(scene, other.refined, other.renders)}
     return {**vars(job), "initial": _initial_errors(scene), "evaluations": [evaluation]}

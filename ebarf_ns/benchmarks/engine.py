@@ -1,7 +1,8 @@
 """How fast the engine is, measured side by side in one run, and how its cost grows with the work.
 
 What is ours needs only torch, numpy, numba and h5py, so that ``python -m ebarf_ns.benchmarks.engine`` also runs on a
-bare machine with a GPU; what it is compared with is measured where nerfstudio is importable, and left out where not.
+bare machine with a GPU (without scipy, poses are straight between keyframes, each of which moves alone); what it is
+compared with is measured where nerfstudio is importable, and left out where not.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from ebarf_ns.events.pairs import DrawAhead, HeldoutBlocks, PairIndex, batch_ran
 from ebarf_ns.events.recording import Recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.so3 import quat_wxyz_exp, rotate
-from ebarf_ns.geometry.trajectory import Poses, corrected, interpolate
+from ebarf_ns.geometry.trajectory import Interpolation, Poses, corrected, interpolate
+from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.photometry.brightness import log_brightness
 from ebarf_ns.photometry.event_loss import reported_change, threshold_loss
 from ebarf_ns.radiance.field import RadianceField, fastest_precision
@@ -280,8 +282,10 @@ class _Step:
         wiggle = torch.sin(torch.linspace(0, 6, keyframes))[:, None] * torch.tensor([0.2, 0.1, 0.05])
         self.start = Poses(wiggle.to(_device()), quat_wxyz_exp(wiggle).to(_device()))
         self.correction = torch.zeros(keyframes, 6, device=_device(), requires_grad=True)
-        parameters = [{"params": self.renderer.parameters(), "lr": 1e-2}, {"params": self.correction, "lr": 0.1}]
-        self.adam = torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
+        adam = torch.optim.Adam(self.renderer.parameters(), lr=1e-2, betas=(0.9, 0.99), eps=1e-15, fused=True)
+        has_scipy = find_spec("scipy") is not None
+        self.optimizers = adam, KeyframeAdam([self.correction], stretches=has_scipy)
+        self.interpolation: Interpolation = "cubic" if has_scipy else "linear"
         self.random = torch.Generator()
         self.number = 0
 
@@ -294,7 +298,8 @@ class _Step:
         self.renderer.begin_step(self.number, self.random)
         drawn = self.draw(self.number)
         t_us = torch.from_numpy(np.r_[drawn.t0_us, drawn.t1_us]).to(_device())
-        poses = interpolate(self.keyframe_t_us, corrected(self.start, self.correction / FOCAL_PX), t_us)
+        keyframes = corrected(self.start, self.correction / FOCAL_PX)
+        poses = interpolate(self.keyframe_t_us, keyframes, t_us, self.interpolation)
         bearing = self.bearing[torch.from_numpy(drawn.pixel).to(_device())].repeat(2, 1)
         rendered = self.renderer(Rays(poses.position, rotate(poses.quat_wxyz, bearing)), self.random)
         before, after = log_brightness(rendered.intensity, "log").chunk(2)
@@ -303,8 +308,9 @@ class _Step:
         )
         reported = reported_change(polarity_sum, event_count, 0.25, 0.25).to(before)
         threshold_loss(after - before, reported, variance.to(before), 0.25).backward()
-        self.adam.step()
-        self.adam.zero_grad()
+        for optimizer in self.optimizers:
+            optimizer.step()
+            optimizer.zero_grad()
         self.number += 1
 
 

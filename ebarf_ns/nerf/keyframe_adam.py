@@ -1,15 +1,20 @@
 """Adam that knows that the six numbers of a keyframe belong together, and that neighbours move together."""
 
+from __future__ import annotations
+
 import warnings
-from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from scipy.sparse import csr_matrix, identity, vstack
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jaxtyping import Float
+    from scipy.sparse import csr_matrix
+    from torch import Tensor
 
 _ROOTS_A_STEP = 256
 _FEW = 4
@@ -86,6 +91,9 @@ def _stretches(
     A stretch is a hat: half of each row between two goes to either; one after the last goes to that whole. And the
     same the other way about, since a product with a transposed view takes many times as long.
     """
+    # Not needed by those who move keyframes one by one.
+    from scipy.sparse import csr_matrix, identity, vstack
+
     level, levels = identity(count, format="csr"), []
     while True:
         levels.append(level)

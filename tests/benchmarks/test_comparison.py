@@ -85,6 +85,19 @@ def test_a_stopped_comparison_goes_on_where_it_stopped(comparison: Path):
     assert {path for path in before if after[path] != before[path]} == {removed}
 
 
+def test_a_scene_made_anew_is_measured_anew(comparison: Path, tmp_path: Path):
+    folder = shutil.copytree(made(comparison, "drift").events.parent, tmp_path / "scene")
+    (tmp_path / "given.yaml").write_text(
+        f"methods: {{broken: ebarf --pipeline.model.samples 0}}\nscenes: {{given: {folder}}}\n"
+        "trajectories: {given: as given}\nseeds: [0]\nseconds: [1]\n"
+    )
+    for number, line in enumerate(["", "# one more\n"]):
+        with read_scene(folder).trajectory.open("a") as file:
+            file.write(line)
+        run_command("ebarf", "bench", tmp_path / "given.yaml", "--output", tmp_path / "out")
+        assert len(list((tmp_path / "out" / "results").iterdir())) == number + 1
+
+
 def test_another_program_joins_by_its_files(comparison: Path, tmp_path: Path):
     scene = made(comparison, "drift")
     assert scene.groundtruth
