@@ -80,11 +80,11 @@ def test_wrong_ratio_of_the_thresholds_is_corrected(tiny_scene: Path, tmp_path: 
     assert text["contrast_threshold"]["on"] == text["contrast_threshold"]["off"]
     text["contrast_threshold"]["on"] *= 1.5
     (scene / "scene.json").write_text(json.dumps(text))
-    # It moves by at most 0.01 a step, and ever less: from 1.5, 200 steps bring it to 1.11 or so.
-    ready = trainer(config(scene, tmp_path, steps=200))
+    # It moves by at most 0.01 a step, and ever less: 200 steps from 1.5 end at 1.11, before it is there.
+    ready = trainer(config(scene, tmp_path, steps=400))
     ready.train()
     on, off, _ = ready.pipeline.model.sensor()
-    assert float(on / off) == pytest.approx(1, abs=0.15)
+    assert float(on / off) == pytest.approx(1, abs=0.1)
 
 
 def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
@@ -95,14 +95,14 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
     unknown.write_text(json.dumps({**json.loads(unknown.read_text()), "contrast_threshold": None}))
     ends = []
     for scene in (known.folder, unknown.parent):
-        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=200))
+        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=400))
         ready.train()
         on, off, _ = ready.pipeline.model.sensor()
         assert float(on / off) == pytest.approx(1.6, rel=0.15)
         ends.append(ready.pipeline.evaluate())
     told, found = ends
     assert found["psnr"] == pytest.approx(told["psnr"], abs=1.0)
-    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.2)
+    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.1)
 
 
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
