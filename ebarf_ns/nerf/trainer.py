@@ -200,8 +200,8 @@ class EbarfTrainer(Trainer):
         if kept is None or not kept.is_file():
             return lines
         before = json.loads(kept.read_text(encoding="utf-8").splitlines()[0]).get("plan", {})
-        resumed = [Line(field, made["value"], "as in the run resumed") for field, made in before.items()]
-        return [next((line for line in resumed if line.field == planned.field), planned) for planned in lines]
+        resumed = {field: Line(field, made["value"], "as in the run resumed") for field, made in before.items()}
+        return [resumed.get(line.field, line) for line in lines]
 
     @check_main_thread
     def _keep_plan(self) -> None:
