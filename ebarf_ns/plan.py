@@ -18,6 +18,7 @@ from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_log, quat_wxyz_
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate
 from ebarf_ns.radiance.field import fastest_precision
 from ebarf_ns.radiance.ray_sampling import Rays, leave_box
+from ebarf_ns.scene import box_of_bounds
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -138,20 +139,18 @@ def _finest(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
 
 def _distance(scene: Scene, trajectory: Trajectory) -> tuple[float, float]:
     """Median distance to the far side of the bounds over keyframes and directions, and the bounds' widest side."""
-    lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
-    size = float((upper - lower).max())
-    centre = (lower + upper) / 2
-    place = (trajectory.poses.position.double() - centre) * 2 / size
-    half_sides = (upper - lower) / size
+    assert scene.bounds is not None
+    centre, scale, half_sides = box_of_bounds(scene.bounds)
+    place = (trajectory.poses.position.double() - centre) * scale
     inside = (place.abs() < half_sides).all(dim=-1).nonzero()[:, 0]
     if not len(inside):
-        return size / 2, size
+        return 1 / scale, 2 / scale
     some = inside[:: max(1, len(inside) // 50)]
     quat_wxyz = trajectory.poses.quat_wxyz[some].double()
     bearing = _some_bearings(scene).double()
     direction = rotate(quat_wxyz[:, None], bearing[None]).flatten(0, 1)
     exits = leave_box(Rays(place[some].repeat_interleave(len(bearing), dim=0), direction), half_sides)
-    return max(float(exits.median()), 0.01) * size / 2, size
+    return max(float(exits.median()), 0.01) / scale, 2 / scale
 
 
 def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:

@@ -1,11 +1,13 @@
 """The scene folder: scene.json and the files it names, read, validated and written."""
 
+from __future__ import annotations
+
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -13,7 +15,14 @@ import torch
 from ebarf_ns.errors import SceneError
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
-from ebarf_ns.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from ebarf_ns.geometry.trajectory import Trajectory
 
 FORMAT, VERSION = "ebarf-scene", 1
 # A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
@@ -96,6 +105,13 @@ def check_bounds(scene: Scene, trajectory: Trajectory) -> None:
             f"{scene.folder / 'scene.json'}: bounds {scene.bounds} hold none of the {len(position)} keyframes of "
             f"{scene.trajectory.name}, the first of which is at {position[0].tolist()}; expected bounds around them"
         )
+
+
+def box_of_bounds(bounds: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "3"], float, Float[Tensor, "3"]]:
+    """Centre, scale and half sides of bounds: ``(x - centre) * scale`` has the longest side reach from -1 to 1."""
+    lower, upper = torch.tensor(bounds, dtype=torch.float64)
+    scale = 2 / float((upper - lower).max())
+    return (lower + upper) / 2, scale, (upper - lower) * scale / 2
 
 
 def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajectory) -> None:

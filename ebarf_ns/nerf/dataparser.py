@@ -19,7 +19,7 @@ from ebarf_ns.errors import one_line_errors
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.scene import Frame, Scene, check_bounds, read_scene
+from ebarf_ns.scene import Frame, Scene, box_of_bounds, check_bounds, read_scene
 
 # Without bounds, the trajectory fills this share of the part of space that is not contracted.
 _TRAJECTORY_SHARE = 0.25
@@ -109,9 +109,8 @@ class EbarfDataParser(DataParser):
 def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:
     check_bounds(scene, trajectory)
     if scene.bounds is not None:
-        lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
-        longest = (upper - lower).max()
-        return Normalization((lower + upper) / 2, 2 / float(longest), ((upper - lower) / longest).float())
+        centre, scale, half_sides = box_of_bounds(scene.bounds)
+        return Normalization(centre, scale, half_sides.float())
     centre = trajectory.poses.position.mean(dim=0)
     radius = float((trajectory.poses.position - centre).norm(dim=-1).max())
     return Normalization(centre, _TRAJECTORY_SHARE / radius if radius > 0 else 1.0, torch.ones(3))
