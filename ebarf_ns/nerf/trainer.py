@@ -290,13 +290,13 @@ class EbarfTrainer(Trainer):
         """Initial trajectory and header first; a run that goes on in its own folder keeps what is there."""
         write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
         path = self.base_dir / "metrics.jsonl"
-        lines = [json.dumps(self._header())]
-        if self._start_step and path.is_file():
-            header, *records = path.read_text(encoding="utf-8").splitlines()
-            # What was evaluated after the checkpoint will be again.
-            lines = [header, *(record for record in records if json.loads(record)["step"] <= self._start_step)]
+        goes_on = self._start_step and path.is_file()
+        lines = path.read_text(encoding="utf-8").splitlines() if goes_on else [json.dumps(self._header())]
+        header, *records = lines
+        # What was evaluated after the checkpoint will be again.
+        records = [record for record in records if json.loads(record)["step"] <= self._start_step]
         with whole_file(path) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            temporary.write_text("\n".join([header, *records]) + "\n", encoding="utf-8")
 
     @check_main_thread
     def _record_metrics(self, record: dict[str, Any]) -> None:
