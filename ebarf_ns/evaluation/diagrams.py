@@ -67,8 +67,8 @@ def error_of(evaluation: Record, name: str) -> float:
 
 
 def _last(record: Record) -> Record:
-    """The last evaluation; of a training that failed, nothing, which is infinitely bad."""
-    return record["evaluations"][-1] if record["evaluations"] else {}
+    """The last evaluation; of a training that failed or that there is none of, nothing, which is infinitely bad."""
+    return record["evaluations"][-1] if record.get("evaluations") else {}
 
 
 def seconds_to(records: Sequence[Record], name: str, target: float) -> float:
@@ -133,10 +133,10 @@ def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
                     continue
                 _draw_curve(axis, own, name, colours[method], _STYLES[roles.get(method, "method")], method)
             given = [error_of(record["initial"], name) for record in group if record["trajectory"] == trajectory]
-            if math.isfinite(np.median(given)):
+            if _AS_GOOD_AS_NOTHING < np.median(given) < math.inf:
                 axis.axhline(float(np.median(given)), color="grey", lw=1, ls="-.", label="as given")
             axis.set(xscale="log", yscale="log", title=f"{scene}, {trajectory}: {title}")
-            seconds = sorted({record["seconds"] for record in group})
+            seconds = sorted({record["seconds"] for record in group} | _first_seconds(group))
             axis.set_xticks(seconds, [f"{one:g}" for one in seconds])
             axis.xaxis.set_minor_formatter(NullFormatter())
             axis.title.set_fontsize(9)
@@ -146,6 +146,12 @@ def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
     axes[0][-1].legend(handles.values(), handles.keys(), fontsize=8)
     figure.tight_layout()
     return figure
+
+
+def _first_seconds(records: Sequence[Record]) -> set[float]:
+    """Where the faint way of the longest training begins."""
+    longest = max(records, key=lambda record: record["seconds"])
+    return {round(evaluation["train_seconds"], 1) for evaluation in longest["evaluations"][:1]}
 
 
 def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, style: str, label: str) -> None:
@@ -246,34 +252,51 @@ def _ends(panels: Panels) -> list[str]:
 
 def _against_others(panels: Panels, roles: dict[str, str]) -> list[str]:
     """What each training has over that of the same scene, trajectory, seed and time by the first method, and by the
-    floor, and which part of the trajectory's errors it left."""
+    floor, after all and after equally many steps, and which part of the trajectory's errors it left."""
     first = next((method for method, role in roles.items() if role == "method"), "")
     floor = next((method for method, role in roles.items() if role == "floor"), "")
     lines = _head(
-        *("scene", "trajectory", "method", "time", f"PSNR over {first}", "PSNR over the floor"),
+        *("scene", "trajectory", "method", "time", f"PSNR over {first}", "PSNR over the floor", "at equal steps"),
         *("position error left", "rotation error left", f"time a step over {first}"),
     )
     for (scene, trajectory), group in panels.items():
-        ends = {(record["method"], record["seed"], record["seconds"]): _last(record) for record in group}
+        by_name = {(record["method"], record["seed"], record["seconds"]): record for record in group}
         for (method, seconds), own in _problems(group, "method", "seconds").items():
             compared = []
             for record in own:
                 # Nothing is told of the first method against itself.
-                by_first = {} if method == first else ends.get((first, record["seed"], seconds), {})
-                by_floor = ends.get((floor, record["seed"], seconds), {})
-                compared.append(_compared(_last(record), record["initial"], by_first, by_floor))
+                by_first = {} if method == first else by_name.get((first, record["seed"], seconds), {})
+                by_floor = by_name.get((floor, record["seed"], seconds), {})
+                compared.append(_compared(record, by_first, by_floor))
             cells = (_spread(values) for values in zip(*compared, strict=True))
             lines += _row(scene, trajectory, method, f"{seconds:g} s", *cells)
     return lines
 
 
-def _compared(end: Record, initial: Record, by_first: Record, by_floor: Record) -> list[float]:
+def _compared(record: Record, by_first: Record, by_floor: Record) -> list[float]:
+    end, end_of_first = _last(record), _last(by_first)
     return [
-        _psnr(end) - _psnr(by_first),
-        _psnr(end) - _psnr(by_floor),
-        *(_ratio(error_of(end, name), error_of(initial, name)) for name in _POSE_ERRORS),
-        _ratio(_seconds_a_step(end), _seconds_a_step(by_first)),
+        _psnr(end) - _psnr(end_of_first),
+        _psnr(end) - _psnr(_last(by_floor)),
+        _psnr_over_at_equal_steps(record, by_floor),
+        *(_ratio(error_of(end, name), error_of(record["initial"], name)) for name in _POSE_ERRORS),
+        _ratio(_seconds_a_step(end), _seconds_a_step(end_of_first)),
     ]
+
+
+def _psnr_over_at_equal_steps(record: Record, other: Record) -> float:
+    """After the most steps that both have had, on straight lines over log(steps) between evaluations."""
+    curves = _psnr_over_log_steps(record), _psnr_over_log_steps(other)
+    if not all(log_steps for log_steps, _ in curves):
+        return math.nan
+    both_had = min(log_steps[-1] for log_steps, _ in curves)
+    ours, theirs = (np.interp(both_had, *curve) for curve in curves)
+    return float(ours - theirs)
+
+
+def _psnr_over_log_steps(record: Record) -> tuple[list[float], list[float]]:
+    counted = [evaluation for evaluation in record.get("evaluations", []) if evaluation.get("step")]
+    return [math.log(evaluation["step"]) for evaluation in counted], [_psnr(evaluation) for evaluation in counted]
 
 
 def _seconds_until(panels: Panels) -> list[str]:
