@@ -54,14 +54,15 @@ def plan_for(
 
     What is decided from the grid's coarsest and finest level follows those given, where they are.
     """
-    finest, why = _finest(scene, trajectory)
+    far_side = _far_side(scene, trajectory)
+    distance = far_side and far_side[0]
+    finest, why = _finest(scene.camera.fx, far_side)
     if finest > (told := max(round(sqrt(events)), 32)):
         finest, why = told, f"so that a wall has a cell for each event; pixels would resolve {finest}"
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
-    bounded = scene.bounds is not None
-    distance = _distance(scene, trajectory)[0] if bounded else None
+    bounded = far_side is not None
     stride, straight = _stride(trajectory, scene.camera.fx, distance)
     precision = fastest_precision(device)
     rays = 16384 if device == "cuda" else 1024
@@ -118,17 +119,16 @@ def apply_plan(lines: list[Line], configuration: Any) -> list[Line]:
     return in_force
 
 
-def _finest(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
+def _finest(focal_px: float, far_side: tuple[float, float] | None) -> tuple[int, str]:
     """Cells per side of the finest level: one for each pixel's footprint where the scene is."""
-    focal_px = scene.camera.fx
-    if scene.bounds is None:
+    if far_side is None:
         # Contracted space is four units wide, and a pixel's footprint in it about 2 / focal_px from one unit on.
         finest = int(np.clip(2 * focal_px, 64, 2048))
         return (
             finest,
             "twice the focal length in pixels, within 64 and 2048: a pixel's footprint beyond the near field",
         )
-    distance, size = _distance(scene, trajectory)
+    distance, size = far_side
     finest = int(np.clip(round(size * focal_px / distance), 64, 2048))
     footprint = distance / focal_px
     return (
@@ -137,9 +137,10 @@ def _finest(scene: Scene, trajectory: Trajectory) -> tuple[int, str]:
     )
 
 
-def _distance(scene: Scene, trajectory: Trajectory) -> tuple[float, float]:
+def _far_side(scene: Scene, trajectory: Trajectory) -> tuple[float, float] | None:
     """Median distance to the far side of the bounds over keyframes and directions, and the bounds' widest side."""
-    assert scene.bounds is not None
+    if scene.bounds is None:
+        return None
     centre, scale, half_sides = box_of_bounds(scene.bounds)
     place = (trajectory.poses.position.double() - centre) * scale
     inside = (place.abs() < half_sides).all(dim=-1).nonzero()[:, 0]
