@@ -8,6 +8,10 @@ from contextlib import contextmanager
 class EbarfError(Exception):
     """Base of everything a user can cause and cure; the message names file, place, value and expectation."""
 
+    def __str__(self) -> str:
+        # What a library says, which messages quote, may have many lines.
+        return " ".join(super().__str__().splitlines())
+
 
 class SceneError(EbarfError):
     """The scene folder or its scene.json is not as the format says."""

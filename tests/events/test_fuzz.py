@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
@@ -52,6 +52,7 @@ def ends_well(path: Path, known: RecordingFormat | None = None) -> None:
 @pytest.mark.parametrize("name", SINGLE)
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(edits=st.lists(EDIT, min_size=1, max_size=6))
+@example(edits=[("flip", 0.984375, b"\x01")])  # a bag whose message definition rosbags quotes in full, line by line
 def test_edited_files(tmp_path: Path, name: str, edits: list[tuple[str, float, bytes]]):
     whole = tmp_path / name
     if not whole.exists():
