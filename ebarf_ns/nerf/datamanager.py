@@ -237,5 +237,5 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
             metadata={"event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None]},
         )
-        columns = ("polarity_sum", "event_count", "duration_us", "variance")
+        columns = ("polarity_sum", "event_count", "variance")
         return bundle, {name: tensor(getattr(pairs, name)) for name in columns}

@@ -54,7 +54,10 @@ class EbarfModelConfig(ModelConfig):
     render_variance: float = 5.0
     """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
     learn_sensor: bool = True
-    """With Eq. 5: learn the ratio of the contrast thresholds and how fast pixels leak, or take them as given."""
+    """With Eq. 5: learn the ratio of the contrast thresholds, or take them as given."""
+    ratio_prior: float = 0.001
+    """How much the ratio of thresholds that are given counts beside the events, all of which count as 1; 0: not at
+    all."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -104,6 +107,7 @@ class EbarfModel(Model):
         given = scene.contrast_threshold or _UNKNOWN_THRESHOLDS
         on, off = (1.0, 1.0) if self.normalized else (given.on, given.off)
         self.sensor = SensorResponse(on, off, config.learn_sensor and not self.normalized)
+        self.ratio_prior = config.ratio_prior if scene.contrast_threshold else 0.0
         self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
             levels=_planned(config.grid_levels),
@@ -152,6 +156,7 @@ class EbarfModel(Model):
         """
         self.random.manual_seed(seed * 1_000_003 + step)
         self.renderer.begin_step(step, self.random)
+        self.camera_optimizer.begin_step(step)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, and what the
@@ -178,9 +183,7 @@ class EbarfModel(Model):
         """The change of log brightness between the two rays of each pair, against what its events report."""
         before, after = outputs["brightness"][:, 0].chunk(2)
         change = after - before
-        on, off, leak_hz = outputs["sensor"]
-        leaked = 1e-6 * leak_hz * batch["duration_us"]
-        reported = reported_change(batch["polarity_sum"], batch["event_count"], on, off, leaked).to(change)
+        reported = reported_change(batch["polarity_sum"], batch["event_count"], *outputs["sensor"]).to(change)
         if self.normalized:
             loss = normalized_loss(change, reported)
         else:
@@ -193,6 +196,8 @@ class EbarfModel(Model):
                 self.config.render_variance,
             )
         losses = {"event_loss": loss}
+        if self.sensor.learned and self.ratio_prior:
+            losses["ratio_prior"] = self.ratio_prior * loss.detach() * self.sensor.implausibility()
         self.camera_optimizer.get_loss_dict(losses)
         return losses
 

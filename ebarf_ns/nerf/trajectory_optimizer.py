@@ -36,6 +36,8 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     prior: float = 0.005
     """How much the trajectory that training begins from counts beside the events, all of which count as 1; 0: not at
     all."""
+    every: int = 2
+    """In every so many-th step the keyframes learn too; in the others the field alone does, which is quicker."""
     interpolation: Interpolation | None = None
     """Between keyframes: straight and at constant velocity (Eq. 3), or with velocities that run on through the
     keyframes; None: as planned."""
@@ -87,6 +89,11 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.way_to_next_knot: Tensor
         if config.mode == "refine":
             self.correction = nn.Parameter(torch.zeros(len(knots), 6))
+
+    def begin_step(self, step: int) -> None:
+        """Let the keyframes learn in every so many-th step: their gradients make it a fifth longer."""
+        if self.config.mode == "refine":
+            self.correction.requires_grad_(step % self.config.every == 0)
 
     def initial(self) -> Poses:
         """The keyframes as they came."""

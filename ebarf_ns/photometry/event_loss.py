@@ -16,14 +16,10 @@ def reported_change(
     event_count: Float[Tensor, "pairs"],
     threshold_on: Tensor | float,
     threshold_off: Tensor | float,
-    leaked: Float[Tensor, "pairs"] | float = 0.0,
 ) -> Float[Tensor, "pairs"]:
-    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one.
-
-    Of the brighter ones, ``leaked`` many report nothing.
-    """
+    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one."""
     brighter = (event_count + polarity_sum) / 2
-    return (brighter - leaked) * threshold_on - (event_count - brighter) * threshold_off
+    return brighter * threshold_on - (event_count - brighter) * threshold_off
 
 
 def threshold_loss(

@@ -57,6 +57,15 @@ def test_small_corrections_cost_and_large_ones_hardly_cost_more():
     assert slopes[0] == 0 and slopes[1] > 20 * slopes[2] > 150 * slopes[3] > 0
 
 
+def test_keyframes_learn_in_every_so_many_th_step():
+    made, learn = optimizer(every=3), []
+    for step in range(7):
+        made.begin_step(step)
+        learn.append(made.poses_at(keyframes().t_us).position.requires_grad)
+    assert learn == [True, False, False, True, False, False, True]
+    optimizer(mode="off").begin_step(0)
+
+
 @pytest.mark.parametrize("options", [{"prior": 0.0}, {"mode": "off"}])
 def test_no_prior_is_no_loss(options: dict):
     losses = {"event_loss": torch.tensor(0.2)}

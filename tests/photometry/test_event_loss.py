@@ -14,9 +14,6 @@ def batch(count: int, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor,
 def test_reported_change_counts_each_polarity_with_its_threshold():
     change = reported_change(torch.tensor([3, -2, 0]), torch.tensor([3, 2, 4]), 0.2, 0.3)
     assert torch.allclose(change, torch.tensor([0.6, -0.6, 2 * 0.2 - 2 * 0.3]))
-    leaked = torch.tensor([0.5, 0.0, 0.25])
-    change = reported_change(torch.tensor([3, -2, 0]), torch.tensor([3, 2, 4]), 0.2, 0.3, leaked)
-    assert torch.allclose(change, torch.tensor([0.5, -0.6, 1.75 * 0.2 - 2 * 0.3]))
 
 
 def test_threshold_loss_is_equation_five_in_thresholds():
