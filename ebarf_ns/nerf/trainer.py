@@ -121,12 +121,15 @@ class GuardedOptimizers(Optimizers):
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Raises :class:`TrainingError` when too many steps in a row had to be skipped."""
-        gradients = [p.grad for group in param_groups for p in self.parameters[group] if p.grad is not None]
+        parameters = [parameter for group in param_groups for parameter in self.parameters[group]]
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         # A gradient scaler looks for overflow itself, and lowers its scale when it finds it. Accumulating gradients, no
         # group may be due.
         trusted = grad_scaler.is_enabled() or not gradients
         if trusted or bool(torch.stack([gradient.sum() for gradient in gradients]).isfinite().all()):
-            self.skipped_in_a_row = 0
+            # A step in which the keyframes do not learn says nothing of their gradients.
+            if len(gradients) == len(parameters):
+                self.skipped_in_a_row = 0
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
         self.skipped += 1

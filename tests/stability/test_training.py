@@ -135,13 +135,14 @@ def test_case_27_a_step_with_a_broken_gradient_changes_nothing(
         poisoned = model.camera_optimizer.correction if broken == "poses" else model.renderer.field.grid.table
         undo = poisoned.register_hook(lambda gradient: gradient * float("nan")).remove
     remembered = {name for name in before if "density_grid" in name or "display_range" in name}
-    ready.train_iteration(1)
+    # Keyframes learn in even steps.
+    ready.train_iteration(2)
     after = state(ready)
     assert all(torch.equal(before[name], after[name]) for name in before if name not in remembered)
     assert moments == [str(one.state_dict()["state"]) for one in ready.optimizers.optimizers.values()]
     assert ready.optimizers.skipped == 1
     undo()
-    ready.train_iteration(2)
+    ready.train_iteration(4)
     assert not same(after, state(ready)) and ready.optimizers.skipped_in_a_row == 0
 
 
