@@ -107,7 +107,7 @@ class EbarfModel(Model):
         given = scene.contrast_threshold or _UNKNOWN_THRESHOLDS
         on, off = (1.0, 1.0) if self.normalized else (given.on, given.off)
         self.sensor = SensorResponse(on, off, config.learn_sensor and not self.normalized)
-        self.ratio_prior = config.ratio_prior if scene.contrast_threshold else 0.0
+        self.ratio_prior = config.ratio_prior if self.sensor.learned and scene.contrast_threshold else 0.0
         self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
             levels=_planned(config.grid_levels),
@@ -196,7 +196,7 @@ class EbarfModel(Model):
                 self.config.render_variance,
             )
         losses = {"event_loss": loss}
-        if self.sensor.learned and self.ratio_prior:
+        if self.ratio_prior:
             losses["ratio_prior"] = self.ratio_prior * loss.detach() * self.sensor.implausibility()
         self.camera_optimizer.get_loss_dict(losses)
         return losses

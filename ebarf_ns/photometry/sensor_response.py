@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _MOST_HALF_LOG_RATIO = math.log(3) / 2
-_WELL_KNOWN = 0.01
+_GOOD_LOG_RATIO = 0.01
 
 
 class Response(NamedTuple):
@@ -50,7 +50,7 @@ class SensorResponse(nn.Module):
         """What speaks for the nominal ratio: it is off by some percent, but nobody knows by how many.
 
         If that number may be of any size, from one percent on, a logarithm x of the ratio over the nominal one costs
-        log(1 + (x / 0.01)²): a large one next to nothing, while a ratio that was right stays where it is. Without it
-        the contrast that renders lack, more for darker than for brighter events, passes for a ratio of thresholds.
+        log(1 + (x / 0.01)²): a large one next to nothing, while a ratio that was right stays where it is. Without it,
+        what contrast renders still lack in bright and in dark places likely passes for a ratio of thresholds.
         """
-        return torch.log1p((2 * self.half_log_ratio / _WELL_KNOWN) ** 2)
+        return torch.log1p((2 * self.half_log_ratio / _GOOD_LOG_RATIO) ** 2)
