@@ -48,11 +48,18 @@ class Line:
 
 
 def plan_for(
-    scene: Scene, trajectory: Trajectory, events: int, device: str, coarsest: int = 8, finest_given: int | None = None
+    scene: Scene,
+    trajectory: Trajectory,
+    events: int,
+    device: str,
+    coarsest: int = 8,
+    finest_given: int | None = None,
+    normalized: bool = False,
 ) -> list[Line]:
     """Decide for a scene, the trajectory that training begins from and a number of events, on "cpu" or "cuda".
 
-    What is decided from the grid's coarsest and finest level follows those given, where they are.
+    What is decided from the grid's coarsest and finest level follows those given, where they are; ``normalized`` is
+    the paper's Eq. 6.
     """
     far_side = _far_side(scene, trajectory)
     distance = far_side and far_side[0]
@@ -98,6 +105,13 @@ def plan_for(
         ),
         Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
         Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(trajectory, scene.camera.fx, distance)),
+        Line(
+            "pipeline.datamanager.silent_share",
+            0.0 if normalized else 0.125,
+            "Eq. 6 has no unit for what silence allows"
+            if normalized
+            else "a silent pixel has changed by less than a threshold",
+        ),
         Line(
             "pipeline.datamanager.train_num_rays_per_batch", rays, f"keeps {'a GPU' if rays > 1024 else 'caches'} full"
         ),

@@ -30,6 +30,17 @@ def test_parts_exist_only_where_the_scene_needs_them(scene: Scene):
     assert planned(dataclasses.replace(scene, bounds=None))["contract"] is True
 
 
+def test_silence_counts_where_thresholds_do(scene: Scene):
+    trajectory = read_tum(scene.trajectory)
+    shares = [
+        line.value
+        for normalized in (False, True)
+        for line in plan_for(scene, trajectory, 500_000, "cpu", normalized=normalized)
+        if line.field == "pipeline.datamanager.silent_share"
+    ]
+    assert shares[0] > 0 and shares[1] == 0
+
+
 def test_resolution_follows_the_pixel_footprint(scene: Scene):
     sharper = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=3 * scene.camera.fx))
     finest = planned(dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=100.0)))["grid_finest"]

@@ -1,15 +1,16 @@
 """Pairs of events at one pixel: what the event generation model (Eq. 1) says something about.
 
-Between two events of a pixel, the log brightness changed by the sum of what the events after the first one report.
-Events are kept ordered by pixel, then time, so that "n steps back" is a subtraction of indices; a running sum of
-polarities over that order gives the sum between any two of them. Batches are a function of (seed, batch number) alone.
+Between two events of a pixel, the log brightness changed by the sum of what the events after the first one report; and
+while the pixel is silent, by less than a threshold more. Events are kept ordered by pixel, then time, so that "n steps
+back" is a subtraction of indices; a running sum of polarities over that order gives the sum between any two of them.
+Batches are a function of (seed, batch number) alone.
 """
 
 from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -36,7 +37,10 @@ _VARIANCE_OF_MISSED = 8.0
 
 @dataclass(frozen=True)
 class EventPairs:
-    """Pairs of events: the pixel, both times, the sum of polarities in (t0, t1] and the number of events in it."""
+    """Pairs of times at a pixel: both, the sum of polarities in (t0, t1] and the number of events in it.
+
+    An event begins each pair, and another one ends it, or else a time at which the pixel is silent.
+    """
 
     pixel: Int64[np.ndarray, "pairs"]
     """Row-major index y * width + x."""
@@ -47,6 +51,8 @@ class EventPairs:
     """With an estimate of the events that the pixel was blind for, both are no whole numbers."""
     variance: Float[np.ndarray, "pairs"]
     """Of the change that they report, up to a factor: one for each event, and much more for each one estimated."""
+    silent: Bool[np.ndarray, "pairs"]
+    """Whether they end between events: the change is what was reported, give or take a threshold."""
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -133,7 +139,20 @@ class PairIndex:
         pixels, pairs = self._count(steps)
         order = (self.events_before, self.busiest, self.first, self.events)
         pixel, *times_and_sums = _look_up(random.integers(pairs), steps, pixels, *order, refractory_us)
-        return EventPairs(pixel, *times_and_sums)
+        return EventPairs(pixel, *times_and_sums, np.zeros(len(pixel), bool))
+
+    def draw_silent(
+        self, count: int, longest: int, span_us: tuple[int, int], random: np.random.Generator, refractory_us: int = 0
+    ) -> EventPairs:
+        """Pairs that end at any time within the span, and begin with an event, 0 to ``longest`` of them before.
+
+        Uniform over time and the pixels that have events; fewer than ``count``, as some ends lie before the first.
+        """
+        pixel = self.busiest[random.integers(np.count_nonzero(self._less_events), size=count)]
+        t1_us = random.integers(span_us[0], span_us[1], size=count, endpoint=True)
+        steps = draw_steps(count, longest + 1, random) - 1
+        known, *times_and_sums = _look_back(pixel, t1_us, steps, self.first, self.events, refractory_us)
+        return EventPairs(pixel, *times_and_sums, np.ones(count, bool)).select(known)
 
     def draw_accepted(
         self,
@@ -154,7 +173,12 @@ class PairIndex:
             drawn = self.draw(draw_steps(min(2 * missing, count), longest, random), random, refractory_us)
             found.append(drawn.select(accepted(drawn)).select(slice(missing)))
             missing -= len(found[-1])
-        return EventPairs(*(np.concatenate([getattr(part, c.name) for part in found]) for c in fields(EventPairs)))
+        return joined(found)
+
+
+def joined(parts: Sequence[EventPairs]) -> EventPairs:
+    """Pairs one after the other."""
+    return EventPairs(*(np.concatenate([getattr(part, c.name) for part in parts]) for c in fields(EventPairs)))
 
 
 @njit(cache=True, nogil=True)
@@ -174,16 +198,51 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events, refra
         pixel[i] = busiest[low]
         pair = number[i] - (events_before[low] - steps[i] * low)
         last = first[pixel[i]] + steps[i] + pair
-        before, after = events[last - steps[i]], events[last]
-        t0_us[i], t1_us[i] = min(before.t_us + refractory_us, after.t_us), after.t_us
-        total[i], count[i] = np.int64(after.running_polarity) - before.running_polarity, steps[i]
-        if refractory_us > 0:
-            for k in range(last - steps[i] + 1, last):
-                missed = _missed(events, k, first[pixel[i]], refractory_us)
-                total[i] += missed
-                count[i] += abs(missed)
-        variance[i] = steps[i] + _VARIANCE_OF_MISSED * (count[i] - steps[i])
+        t1_us[i] = events[last].t_us
+        t0_us[i] = min(events[last - steps[i]].t_us + refractory_us, t1_us[i])
+        total[i], count[i], variance[i] = _told(events, first, pixel[i], last - steps[i], last, last, refractory_us)
     return pixel, t0_us, t1_us, total, count, variance
+
+
+@njit(cache=True, nogil=True)
+def _look_back(pixel, t1_us, steps, first, events, refractory_us):
+    """Whether there is an event before each time, and what :class:`EventPairs` holds of the pair that ends then."""
+    known, t0_us = np.zeros(len(pixel), np.bool_), t1_us.copy()
+    total, count, variance = np.zeros(len(pixel)), np.zeros(len(pixel)), np.zeros(len(pixel))
+    for i in range(len(pixel)):
+        begin, low = first[pixel[i]], first[pixel[i]]
+        high = end = first[pixel[i] + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if events[middle].t_us <= t1_us[i]:
+                low = middle + 1
+            else:
+                high = middle
+        last = low - 1
+        if last < begin:
+            continue
+        known[i] = True
+        before = max(last - steps[i], begin)
+        t0_us[i] = min(events[before].t_us + refractory_us, t1_us[i])
+        # What the pixel missed after its last event is known by the next one, where there is one.
+        after = min(low, end - 1)
+        total[i], count[i], variance[i] = _told(events, first, pixel[i], before, last, after, refractory_us)
+    return known, t0_us, t1_us, total, count, variance
+
+
+@njit(cache=True, inline="always")
+def _told(events, first, pixel, before, last, after, refractory_us):
+    """Sum of polarities, count and variance of the events of a pixel after ``before`` up to ``last``, with what was
+    missed between those up to ``after``."""
+    steps = last - before
+    total = np.float64(np.int64(events[last].running_polarity) - events[before].running_polarity)
+    count = np.float64(steps)
+    if refractory_us > 0:
+        for k in range(before + 1, after):
+            missed = _missed(events, k, first[pixel], refractory_us)
+            total += missed
+            count += abs(missed)
+    return total, count, steps + _VARIANCE_OF_MISSED * (count - steps)
 
 
 @njit(cache=True, inline="always")

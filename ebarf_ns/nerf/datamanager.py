@@ -25,6 +25,7 @@ from ebarf_ns.events.pairs import (
     accumulate,
     batch_random,
     index_pairs,
+    joined,
 )
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.geometry.trajectory import Trajectory
@@ -82,6 +83,8 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Rays of the held-out pairs: two for each."""
     longest_pair: int = 30
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
+    silent_share: float | None = None
+    """Share of a batch's pairs that end while the pixel is silent, not with an event; None: as planned."""
     refractory_us: int | None = None
     """How long a pixel is blind after an event; None: as the recording shows it, 0: not at all."""
     leave_out_hot_pixels: bool = True
@@ -177,7 +180,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
 
     def _draw_training_pairs(self, batch: int) -> EventPairs:
-        count = self.get_train_rays_per_batch() // 2
+        total = self.get_train_rays_per_batch() // 2
+        silent = min(int(total * (self.config.silent_share or 0.0)), total - 1)
+        count = total - silent
         random = batch_random(self.config.seed, batch)
         pairs = self._training_index.draw_accepted(
             count, self.config.longest_pair, random, self._heldout_blocks.training, self.refractory_us
@@ -187,7 +192,13 @@ class EventDataManager(VanillaDataManager[EventDataset]):
                 f"{self.train_dataset.scene.events}: next to no pair of events lies outside the held-out "
                 f"{self.config.heldout_share:.0%} of the recording: no pair to train on"
             )
-        return pairs
+        if not silent:
+            return pairs
+        # Twice as many, as some of them end before the first event or in held-out time.
+        drawn = self._training_index.draw_silent(
+            2 * silent, self.config.longest_pair, self.span_us, random, self.refractory_us
+        )
+        return joined([pairs, drawn.select(self._heldout_blocks.training(drawn)).select(slice(silent))])
 
     @cached_property
     def heldout_pairs(self) -> EventPairs:
@@ -237,5 +248,5 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
             metadata={"event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None]},
         )
-        columns = ("polarity_sum", "event_count", "variance")
+        columns = ("polarity_sum", "event_count", "variance", "silent")
         return bundle, {name: tensor(getattr(pairs, name)) for name in columns}

@@ -15,7 +15,7 @@ from torch import Tensor
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
-from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss
+from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
 from ebarf_ns.photometry.sensor_response import SensorResponse
 from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
 from ebarf_ns.radiance.hash_grid import HashGridShape
@@ -25,6 +25,8 @@ from ebarf_ns.scene import ContrastThreshold, Scene
 
 # Log brightness is known up to a factor, which the field can follow: 0.1 or 0.6 in place of 0.25 cost 1 to 2 dB.
 _UNKNOWN_THRESHOLDS = ContrastThreshold(0.25, 0.25)
+# Steps after which silence tells the ratio of the thresholds; a field that is still empty has no brightness to compare.
+_TAKES_SHAPE = 1000
 T = TypeVar("T")
 
 
@@ -142,6 +144,7 @@ class EbarfModel(Model):
         self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
         self.display_range: Tensor
         self.random = torch.Generator()
+        self.has_taken_shape = False
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Two groups: fields, with what is learned of the sensor, and camera_opt for the keyframe corrections."""
@@ -155,6 +158,7 @@ class EbarfModel(Model):
         Each process of several has a seed of its own; what the first one remembers of densities goes for all.
         """
         self.random.manual_seed(seed * 1_000_003 + step)
+        self.has_taken_shape = step >= _TAKES_SHAPE
         self.renderer.begin_step(step, self.random)
         self.camera_optimizer.begin_step(step)
 
@@ -187,9 +191,13 @@ class EbarfModel(Model):
         if self.normalized:
             loss = normalized_loss(change, reported)
         else:
+            silent = batch["silent"]
+            if self.has_taken_shape and bool(silent.any()):
+                # The others end on slopes, and that those are rendered a little too gently passes for a ratio.
+                reported = torch.where(silent, reported, reported.detach())
             loss = threshold_loss(
                 change,
-                reported,
+                nearest_allowed(change, reported, silent, *outputs["sensor"]),
                 batch["variance"].to(change),
                 self.mean_threshold,
                 self.config.outliers_from,

@@ -39,6 +39,7 @@ _LEAST = {
     "pipeline.datamanager.train_num_rays_per_batch": 2,
     "pipeline.datamanager.eval_num_rays_per_batch": 2,
     "pipeline.datamanager.longest_pair": 1,
+    "pipeline.datamanager.silent_share": 0,
     "pipeline.datamanager.refractory_us": 0,
     "pipeline.datamanager.heldout_share": 0,
     "pipeline.datamanager.index_memory_gib": 1e-6,
@@ -194,7 +195,8 @@ class EbarfTrainer(Trainer):
         device = "cuda" if self.device.startswith("cuda") else "cpu"
         model: Any = self.config.pipeline.model
         start = model.camera_optimizer.start(trajectory)
-        lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest)
+        normalized = model.loss == "normalized"
+        lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized)
         self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
         self._keep_plan()
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 
 def reported_change(
@@ -20,6 +20,22 @@ def reported_change(
     """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one."""
     brighter = (event_count + polarity_sum) / 2
     return brighter * threshold_on - (event_count - brighter) * threshold_off
+
+
+def nearest_allowed(
+    change: Float[Tensor, "pairs"],
+    reported: Float[Tensor, "pairs"],
+    silent: Bool[Tensor, "pairs"],
+    threshold_on: Tensor | float,
+    threshold_off: Tensor | float,
+) -> Float[Tensor, "pairs"]:
+    """The change that events allow and that is nearest to the rendered one, as a target: no gradient to ``change``.
+
+    A pair that ends with an event changed by what was reported. While its pixel is ``silent`` since, it rose by less
+    than C_on beyond that, and fell by less than C_off (the no-event loss of E-NeRF, Klenk et al. 2023).
+    """
+    most, least = (torch.as_tensor(threshold).detach().to(change) for threshold in (threshold_on, threshold_off))
+    return reported + silent * (change - reported).detach().clamp(-least, most)
 
 
 def threshold_loss(

@@ -63,6 +63,32 @@ def test_every_pair_is_what_the_stream_says(seed: int, count: int, steps: int):
         )
 
 
+@settings(max_examples=30)
+@given(st.integers(0, 1000), st.integers(30, 200), st.integers(1, 5))
+def test_every_silent_pair_is_what_the_stream_says(seed: int, count: int, longest: int):
+    events = recording(seed, count)
+    pairs = index_of(events).draw_silent(300, longest, (0, 1000), np.random.default_rng(seed))
+    truth = by_pixel(events)
+    assert 100 < len(pairs) <= 300 and pairs.silent.all()
+    for pixel, t0, t1, total, number in zip(
+        pairs.pixel, pairs.t0_us, pairs.t1_us, pairs.polarity_sum, pairs.event_count, strict=True
+    ):
+        rows = [row for row in truth[int(pixel)] if events.t_us[row] <= t1]
+        begin = len(rows) - 1 - int(number)
+        assert 0 <= number <= longest and begin >= 0
+        assert events.t_us[rows[begin]] == t0 and events.polarity[rows[begin + 1 :]].sum() == total
+
+
+def test_silent_pairs_end_at_any_time_and_at_every_pixel_with_events():
+    events = recording(1, 400)
+    pairs = index_of(events).draw_silent(20_000, 3, (0, 2000), np.random.default_rng(0))
+    assert set(pairs.pixel.tolist()) == set(by_pixel(events))
+    # After the last event of all, every time is as likely as any other.
+    late = pairs.t1_us[pairs.t1_us > 1000]
+    assert np.abs(np.histogram(late, 10, (1000, 2000))[0] / len(late) - 0.1).max() < 0.02
+    assert set(pairs.event_count.tolist()) == {0, 1, 2, 3}
+
+
 def test_pairs_are_drawn_uniformly_and_all_of_them():
     events = recording(1, 60)
     # Times that tell every event from every other.
@@ -267,6 +293,18 @@ def test_what_was_missed_goes_by_the_faster_neighbour():
     # A threshold takes 4 ms but for the one in the middle, 1 ms, as long as the pixel is blind before and after it.
     pairs = spaced(np.array([5000, 2000, 5000])).draw(np.array([3]), np.random.default_rng(0), 1000)
     assert pairs.polarity_sum[0] == 3 + 2
+
+
+def test_what_was_missed_before_the_silence_counts_too():
+    # As above, with the time in which the pixel was blind after its last event but one, and after its last, in it.
+    index = spaced(np.full(9, 5000))
+    pairs = index.draw_silent(500, 3, (20_000, 39_999), np.random.default_rng(0), 1000)
+    assert np.allclose(pairs.polarity_sum, pairs.event_count * 1.0)
+    assert np.allclose(pairs.event_count, np.round(pairs.event_count / 1.25) * 1.25)
+    assert np.allclose(pairs.variance, pairs.event_count / 1.25 * (1 + 8 * 0.25))
+    # What follows the very last one is not known.
+    after = index.draw_silent(500, 1, (45_000, 50_000), np.random.default_rng(0), 1000)
+    assert set(after.event_count.tolist()) == {0.0, 1.0}
 
 
 def test_no_more_than_three_events_are_missed_at_a_time():

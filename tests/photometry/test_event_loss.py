@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss
+from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
 
 
 def batch(count: int, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -22,6 +22,17 @@ def test_threshold_loss_is_equation_five_in_thresholds():
     assert float(loss) == pytest.approx((1.0 + 0.04) / 2)
     longer = threshold_loss(change, torch.tensor([0.25, -0.25]), torch.tensor([4, 4]), 0.25)
     assert float(longer) == pytest.approx(float(loss) / 4)
+
+
+def test_while_a_pixel_is_silent_it_may_have_changed_by_less_than_a_threshold():
+    change = torch.tensor([0.1, 0.5, -0.25, -0.35, 0.1], requires_grad=True)
+    silent = torch.tensor([True, True, True, True, False])
+    allowed = nearest_allowed(change, torch.zeros(5), silent, torch.tensor(0.2), torch.tensor(0.3))
+    assert torch.allclose(allowed, torch.tensor([0.1, 0.2, -0.25, -0.3, 0.0]))
+    assert not allowed.requires_grad
+    reported = torch.tensor([1.0, 1.0], requires_grad=True)
+    allowed = nearest_allowed(torch.tensor([1.1, 3.0]), reported, torch.tensor([True, False]), 0.2, 0.3)
+    assert torch.autograd.grad(allowed.sum(), reported)[0].tolist() == [1.0, 1.0]
 
 
 def test_what_renders_are_wrong_by_makes_long_pairs_weigh_little_less_than_short_ones():

@@ -186,7 +186,8 @@ MODEL_CHANGES = {
 }  # fmt: skip
 POSE_CHANGES = {"smooth": False, "interpolation": "linear", "mode": "off", "keyframe_stride": 3}
 DATA_CHANGES = {
-    "train_num_rays_per_batch": 64, "longest_pair": 3, "refractory_us": 2000, "heldout_share": 0.2, "seed": 5
+    "train_num_rays_per_batch": 64, "longest_pair": 3, "silent_share": 0.0, "refractory_us": 2000,
+    "heldout_share": 0.2, "seed": 5,
 }  # fmt: skip
 
 
