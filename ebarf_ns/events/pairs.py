@@ -139,7 +139,7 @@ class PairIndex:
         pixels, pairs = self._count(steps)
         order = (self.events_before, self.busiest, self.first, self.events)
         pixel, *times_and_sums = _look_up(random.integers(pairs), steps, pixels, *order, refractory_us)
-        return EventPairs(pixel, *times_and_sums, np.zeros(len(pixel), bool))
+        return EventPairs(pixel, *times_and_sums, silent=np.zeros(len(pixel), bool))
 
     def draw_silent(
         self, count: int, longest: int, span_us: tuple[int, int], random: np.random.Generator, refractory_us: int = 0
@@ -152,7 +152,7 @@ class PairIndex:
         t1_us = random.integers(span_us[0], span_us[1], size=count, endpoint=True)
         steps = draw_steps(count, longest + 1, random) - 1
         known, *times_and_sums = _look_back(pixel, t1_us, steps, self.first, self.events, refractory_us)
-        return EventPairs(pixel, *times_and_sums, np.ones(count, bool)).select(known)
+        return EventPairs(pixel, *times_and_sums, silent=np.ones(count, bool)).select(known)
 
     def draw_accepted(
         self,
