@@ -192,9 +192,10 @@ class EbarfModel(Model):
             loss = normalized_loss(change, reported)
         else:
             silent = batch["silent"]
-            if self.has_taken_shape and bool(silent.any()):
-                # The others end on slopes, and that those are rendered a little too gently passes for a ratio.
-                reported = torch.where(silent, reported, reported.detach())
+            if bool(silent.any()):
+                # Events lie on slopes. They find a ratio that is far off, but that slopes are rendered a little too
+                # gently passes for one too.
+                reported = torch.where(silent == self.has_taken_shape, reported, reported.detach())
             loss = threshold_loss(
                 change,
                 nearest_allowed(change, reported, silent, *outputs["sensor"]),
