@@ -89,6 +89,11 @@ def plan_for(
             f"{1 << rows_log2:,} rows, at most 524,288: a wall has {finest}² cells",
         ),
         Line(
+            "pipeline.model.broad_cells",
+            16,
+            "brightness at large is learned as quickly as edges: slopes across a room otherwise come last",
+        ),
+        Line(
             "pipeline.model.density_cells",
             int(np.clip(finest, 32, 128)),
             "as the finest level, up to 128: the better remembered, the fewer samples do",

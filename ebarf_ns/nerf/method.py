@@ -68,6 +68,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         grid_coarsest=16,
         grid_finest=512,
         grid_table_size_log2=17,
+        broad_cells=0,
         precision="float32",
     )
     datamanager = EventDataManagerConfig(

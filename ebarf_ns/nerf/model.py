@@ -76,6 +76,9 @@ class EbarfModelConfig(ModelConfig):
     """Cells per side of the finest level; None: as planned."""
     grid_table_size_log2: int | None = None
     """Rows of the table a level; None: as planned."""
+    broad_cells: int | None = None
+    """Cells per side of the finest of the lattices that log brightness at large is learned in; 0: none; None: as
+    planned."""
     sampling: Literal["importance", "uniform"] = "importance"
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
     samples: int | None = None
@@ -124,6 +127,7 @@ class EbarfModel(Model):
             config.view_dependent,
             config.intensity_range,
             precision=_planned(config.precision),
+            broad_cells=_planned(config.broad_cells),
         )
         sampling = Sampling(
             _planned(config.samples),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from math import ceil, log2
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
+from torch.nn.functional import interpolate
 
 from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape
 
@@ -40,8 +43,34 @@ def _harmonics(direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 8"
     return torch.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], dim=-1)
 
 
+class BroadBrightness(nn.Module):
+    """Log brightness at large: lattices of ``cells``, half as many, ... and 2 cells per side, added up.
+
+    An event tells a slope, and a slope across a room is the sum of thousands, each of which wants but its own place
+    to change. Numbers that each reach far give such sums a direction of their own to go in (the multilevel
+    preconditioner of Bramble, Pasciak & Xu 1990); from hash grid and MLP they come last of all.
+    """
+
+    def __init__(self, cells: int):
+        super().__init__()
+        side = cells + 1
+        self.finest = HashGrid(HashGridShape(1, 1, side, side, ceil(log2(side**3))))
+        sides = [(1 << power) + 1 for power in range(1, ceil(log2(cells)))]
+        self.coarser = nn.ParameterList(nn.Parameter(torch.zeros(1, 1, side, side, side)) for side in sides)
+
+    def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """What is added to the raw intensity at points in the unit cube, which do not move for it."""
+        side, rows = self.finest.shape.coarsest, self.finest.table
+        finest, beyond = rows.split([side**3, len(rows) - side**3])
+        total, *finer = *self.coarser, finest.view(1, 1, side, side, side)
+        for lattice in finer:
+            total = interpolate(total, lattice.shape[2:], mode="trilinear", align_corners=True) + lattice
+        table = torch.cat([total.view(-1, 1), beyond])
+        return functional_call(self.finest, {"table": table}, (point.detach(),))[:, 0]
+
+
 class RadianceField(nn.Module):
-    """Hash grid, a density MLP and an intensity head.
+    """Hash grid, a density MLP and an intensity head; where ``broad_cells``, lattices for brightness at large.
 
     ``bounded``: the scene lies in [-1, 1]³; else space is contracted. ``intensity_range``: ``unit`` is a sigmoid
     (the reference implementation's), ``positive`` an exponential, for scenes of any dynamic range. ``precision`` is
@@ -56,6 +85,7 @@ class RadianceField(nn.Module):
         intensity_range: IntensityRange = "positive",
         hidden: int = 64,
         precision: Precision = "float32",
+        broad_cells: int = 0,
     ):
         super().__init__()
         self.bounded = bounded
@@ -63,6 +93,7 @@ class RadianceField(nn.Module):
         self.intensity_range = intensity_range
         self.precision = precision
         self.grid = HashGrid(shape)
+        self.broad = BroadBrightness(broad_cells) if broad_cells else None
         self.trunk = nn.Sequential(nn.Linear(shape.width, hidden), nn.ReLU(), nn.Linear(hidden, 16))
         inputs = 15 + (8 if view_dependent else 0)
         self.head = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1))
@@ -87,7 +118,8 @@ class RadianceField(nn.Module):
     ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points"]]:
         """Density and intensity; ``direction`` (unit vectors) is needed only when ``view_dependent``."""
         # Splitting, unlike slicing, has a gradient that needs no array of zeros for every piece.
-        chunks = _chunks(self.grid(self._unit_cube(point)))
+        point = self._unit_cube(point)
+        chunks = _chunks(self.grid(point))
         view = [None] * len(chunks)
         if self.view_dependent:
             assert direction is not None
@@ -100,6 +132,8 @@ class RadianceField(nn.Module):
                 densities.append(density)
                 intensities.append(self.head(inputs))
         density, intensity = (torch.cat(raw)[:, 0].to(point.dtype) for raw in (densities, intensities))
+        if self.broad:
+            intensity = intensity + self.broad(point)
         return self._activate_density(density), self._activate_intensity(intensity)
 
     def _activate_intensity(self, raw: Float[Tensor, "points"]) -> Float[Tensor, "points"]:
