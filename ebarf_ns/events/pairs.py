@@ -98,6 +98,11 @@ class PairIndex:
         """Minus the number of events of each of ``busiest``, which rises."""
         return -np.diff(self.events_before)
 
+    @cached_property
+    def _counting_pixels(self) -> int:
+        """Number of pixels that have events and are not hot: the first of ``busiest``."""
+        return int(np.count_nonzero(self._less_events))
+
     def _count(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels that have pairs that many steps apart, which are the first of ``busiest``, and the pairs in them."""
         pixels = np.searchsorted(self._less_events, -steps)
@@ -106,7 +111,7 @@ class PairIndex:
     @property
     def hot_pixels(self) -> int:
         """Number of pixels that are left out for being far busier than usual."""
-        return int(np.count_nonzero(np.diff(self.first)) - np.count_nonzero(self._less_events))
+        return int(np.count_nonzero(np.diff(self.first))) - self._counting_pixels
 
     def with_hot_pixels(self) -> PairIndex:
         """The same events, those of hot pixels counting like all others."""
@@ -148,7 +153,7 @@ class PairIndex:
 
         Uniform over time and the pixels that have events; fewer than ``count``, as some ends lie before the first.
         """
-        pixel = self.busiest[random.integers(np.count_nonzero(self._less_events), size=count)]
+        pixel = self.busiest[random.integers(self._counting_pixels, size=count)]
         t1_us = random.integers(span_us[0], span_us[1], size=count, endpoint=True)
         steps = draw_steps(count, longest + 1, random) - 1
         known, *times_and_sums = _look_back(pixel, t1_us, steps, self.first, self.events, refractory_us)

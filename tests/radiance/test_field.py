@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ebarf_ns.radiance.field import RadianceField, contract
+from ebarf_ns.radiance.field import BroadBrightness, RadianceField, contract
 from ebarf_ns.radiance.hash_grid import HashGridShape
 
 SHAPE = HashGridShape(levels=4, features=2, coarsest=4, finest=32, table_size_log2=10)
@@ -78,3 +78,28 @@ def test_pieces_that_stay_in_cache_add_up_to_the_whole(monkeypatch: pytest.Monke
     monkeypatch.setattr("ebarf_ns.radiance.field._CHUNK", 300)
     for one, other in zip(whole, field(point, direction), strict=True):
         assert torch.allclose(one, other, atol=1e-6)
+
+
+@pytest.mark.parametrize("cells", [1, 2, 3, 16])
+def test_each_lattice_of_brightness_at_large_is_heard_everywhere_between_its_nodes(cells: int):
+    torch.manual_seed(0)
+    broad, point = BroadBrightness(cells), torch.rand(1000, 3, requires_grad=True)
+    lattices = [*broad.coarser, broad.finest.table]
+    assert broad(point).abs().max() < 1e-3, "all begin with next to nothing"
+    for lattice in lattices:
+        for each in lattices:
+            torch.nn.init.zeros_(each)
+        torch.nn.init.ones_(lattice)
+        assert torch.allclose(broad(point), torch.ones(1000))
+    broad(point).sum().backward()
+    assert point.grad is None and all(lattice.grad is not None for lattice in lattices)
+
+
+def test_brightness_at_large_leaves_density_alone():
+    field, point = RadianceField(SHAPE, bounded=False, broad_cells=4), torch.randn(100, 3)
+    density, intensity = field(point, None)
+    assert field.broad is not None
+    torch.nn.init.constant_(field.broad.coarser[0], 0.5)
+    brighter_density, brighter = field(point, None)
+    assert torch.equal(density, brighter_density)
+    assert torch.allclose(brighter.log() - intensity.log(), torch.full((100,), 0.5), atol=1e-3)
