@@ -95,7 +95,8 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
     unknown.write_text(json.dumps({**json.loads(unknown.read_text()), "contrast_threshold": None}))
     ends = []
     for scene in (known.folder, unknown.parent):
-        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=400))
+        # A field that is yet to take shape bends the ratio; that passes.
+        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=1500))
         ready.train()
         on, off = ready.pipeline.model.sensor()
         assert float(on / off) == pytest.approx(1.6, rel=0.15)
