@@ -103,7 +103,7 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
         ends.append(ready.pipeline.evaluate())
     told, found = ends
     assert found["psnr"] == pytest.approx(told["psnr"], abs=1.0)
-    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.1)
+    assert found["heldout_event_loss"] < 1.1 * told["heldout_event_loss"], "not knowing them costs nothing"
 
 
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
