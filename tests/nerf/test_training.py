@@ -96,14 +96,14 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
     ends = []
     for scene in (known.folder, unknown.parent):
         # A field that is yet to take shape bends the ratio; that passes.
-        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=1500))
+        ready = trainer(config(scene, tmp_path / f"run of {scene.name}", steps=2500))
         ready.train()
         on, off = ready.pipeline.model.sensor()
         assert float(on / off) == pytest.approx(1.6, rel=0.15)
         ends.append(ready.pipeline.evaluate())
     told, found = ends
     assert found["psnr"] == pytest.approx(told["psnr"], abs=1.0)
-    assert found["heldout_event_loss"] < 1.1 * told["heldout_event_loss"], "not knowing them costs nothing"
+    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.1)
 
 
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
