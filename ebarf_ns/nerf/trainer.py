@@ -48,6 +48,7 @@ _LEAST = {
     "pipeline.model.grid_coarsest": 2,
     "pipeline.model.grid_finest": 2,
     "pipeline.model.grid_table_size_log2": 1,
+    "pipeline.model.broad_cells": 0,
     "pipeline.model.density_cells": 1,
     "pipeline.model.coarse_samples": 1,
     "pipeline.model.uniform_share": 0,

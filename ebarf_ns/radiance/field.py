@@ -55,8 +55,8 @@ class BroadBrightness(nn.Module):
         super().__init__()
         side = cells + 1
         self.finest = HashGrid(HashGridShape(1, 1, side, side, ceil(log2(side**3))))
-        sides = [(1 << power) + 1 for power in range(1, ceil(log2(cells)))]
-        self.coarser = nn.ParameterList(nn.Parameter(torch.zeros(1, 1, side, side, side)) for side in sides)
+        coarser = [(1 << power) + 1 for power in range(1, ceil(log2(cells)))]
+        self.coarser = nn.ParameterList(nn.Parameter(torch.zeros(1, 1, *[nodes] * 3)) for nodes in coarser)
 
     def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """What is added to the raw intensity at points in the unit cube, which do not move for it."""
