@@ -184,6 +184,12 @@ class EbarfTrainer(Trainer):
             value = reduce(getattr, flag.split("."), self.config)
             if value is not None and not value >= least:
                 raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
+        silent = self.config.pipeline.datamanager.silent_share  # pyright: ignore[reportAttributeAccessIssue]
+        if silent and self.config.pipeline.model.loss == "normalized":  # pyright: ignore[reportAttributeAccessIssue]
+            raise TrainingError(
+                f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
+                "Eq. 6 has no unit for what silence allows"
+            )
 
     def _plan(self) -> None:
         """Fill in what the configuration leaves to the plan, and keep it with the run."""

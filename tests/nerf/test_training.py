@@ -237,6 +237,14 @@ def test_settings_that_make_no_sense_are_named(
     assert f"--{part}.{field}".replace("_", "-") + f" is {value}, expected at least" in capsys.readouterr().err
 
 
+def test_silence_without_a_unit_is_named(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    made = config(tiny_scene, tmp_path, "ebarf-paper")
+    made.pipeline.datamanager.silent_share = 0.125  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(SystemExit):
+        trainer(made)
+    assert "--pipeline.datamanager.silent-share is 0.125, expected 0 with" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("folder", ["its own", "another"])
 def test_a_resumed_run_keeps_its_plan_and_its_records(tiny_scene: Path, tmp_path: Path, folder: str):
     made = config(tiny_scene, tmp_path, steps=4)
