@@ -87,6 +87,7 @@ def test_wrong_ratio_of_the_thresholds_is_corrected(tiny_scene: Path, tmp_path: 
     assert float(on / off) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
     sensor = SensorModel(threshold_on=0.4, threshold_off=0.25)
     tiny = Simulation(duration_s=0.5, width=48, height=36, focal_px=41.0, frames=3, sensor=sensor)
