@@ -184,8 +184,9 @@ class EbarfTrainer(Trainer):
             value = reduce(getattr, flag.split("."), self.config)
             if value is not None and not value >= least:
                 raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
-        silent = self.config.pipeline.datamanager.silent_share  # pyright: ignore[reportAttributeAccessIssue]
-        if silent and self.config.pipeline.model.loss == "normalized":  # pyright: ignore[reportAttributeAccessIssue]
+        pipeline: Any = self.config.pipeline
+        silent = pipeline.datamanager.silent_share
+        if silent and pipeline.model.loss == "normalized":
             raise TrainingError(
                 f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
                 "Eq. 6 has no unit for what silence allows"
