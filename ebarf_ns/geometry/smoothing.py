@@ -14,11 +14,13 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _FEWEST = 5  # a cubic smoothing spline needs five knots
-_FEW, _MOST = 120, 400
+_MOST = 400
+_ROBUSTNESS = 0.5
 
 
 def smoothed(trajectory: Trajectory) -> Trajectory:
-    """The keyframes moved onto a smoothing spline whose stiffness generalised cross-validation chooses.
+    """The keyframes moved onto a smoothing spline, one for positions and one for rotations, whose stiffness generalised
+    cross-validation chooses.
 
     Independent errors of the keyframes shrink by the number of keyframes per movement; keyframes that already lie on
     a smooth path are left where they are, since cross-validation then chooses no smoothing (Craven & Wahba 1978).
@@ -38,27 +40,24 @@ def smoothed(trajectory: Trajectory) -> Trajectory:
 
 
 def _smooth(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "keyframes dim"]) -> np.ndarray:
-    return np.stack([_smooth_column(t, column) for column in columns.T], axis=1)
-
-
-def _smooth_column(t: Float[np.ndarray, "keyframes"], column: Float[np.ndarray, "keyframes"]) -> np.ndarray:
-    spread = np.ptp(column)
+    spread = np.ptp(columns, axis=0).max()
     # Cross-validation divides by what is left to explain, which must not be rounding error.
-    if spread <= 1e-9 * max(1.0, float(np.abs(column).max())):
-        return column
-    unit = (column - column[0]) / spread
-    # scipy's own choice is the safer one among few keyframes, and among many falls short and takes minutes. Of very
-    # many, every so-manieth tells; the best stiffness grows with the fifth root of their number.
+    if spread <= 1e-9 * max(1.0, float(np.abs(columns).max())):
+        return columns
+    unit = (columns - columns[0]) / spread
+    # Of very many, every so-manieth tells; the best stiffness grows with the fifth root of their number.
     every = -(-len(t) // _MOST)
-    stiffness = _stiffness(t[::every], unit[::every]) * every**0.2 if len(t) > _FEW else None
-    return make_smoothing_spline(t, unit, lam=stiffness)(t) * spread + column[0]
+    stiffness = _stiffness(t[::every], unit[::every]) * every**0.2
+    return make_smoothing_spline(t, unit, lam=stiffness)(t) * spread + columns[0]
 
 
-def _stiffness(t: Float[np.ndarray, "keyframes"], column: Float[np.ndarray, "keyframes"]) -> float:
-    """The weight of bending against distance that minimises the generalised cross-validation score.
+def _stiffness(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "keyframes dim"]) -> float:
+    """The weight of bending against distance that minimises the robust score of generalised cross-validation.
 
-    With the bending energy f' K f, K = Q R⁻¹ Q' (Green & Silverman 1994, 2.1), a fit is (1 + weight K)⁻¹ y; in the
-    eigenvectors of K every weight is tried at once.
+    With the bending energy f' K f, K = Q R⁻¹ Q' (Green & Silverman 1994, 2.1), a fit is A y, A = (1 + weight K)⁻¹; in
+    the eigenvectors of K every weight is tried at once. Columns err alike, and choose together. Among few keyframes
+    the plain score now and then follows the noise; here it is multiplied by how much of that a fit takes on, between a
+    half and one for tr(A²) between 0 and all (Lukas 2006).
     """
     gap = np.diff(t)
     inner = np.arange(len(t) - 2)
@@ -69,5 +68,7 @@ def _stiffness(t: Float[np.ndarray, "keyframes"], column: Float[np.ndarray, "key
     bending, direction = np.linalg.eigh(second @ np.linalg.solve(mass, second.T))
     weights = np.geomspace(1e-8, 1e12, 201)
     left_out = weights[:, None] * bending.clip(0) / (1 + weights[:, None] * bending.clip(0))
-    score = (left_out**2 * (direction.T @ column) ** 2).sum(axis=1) / left_out.sum(axis=1) ** 2
-    return float(weights[score.argmin()])
+    power = np.square(direction.T @ columns).sum(axis=1)
+    score = (left_out**2 * power).sum(axis=1) / left_out.sum(axis=1) ** 2
+    taken_on = _ROBUSTNESS + (1 - _ROBUSTNESS) * np.square(1 - left_out).mean(axis=1)
+    return float(weights[(score * taken_on).argmin()])
