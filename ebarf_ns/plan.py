@@ -64,8 +64,10 @@ def plan_for(
     far_side = _far_side(scene, trajectory)
     distance = far_side and far_side[0]
     finest, why = _finest(scene.camera.fx, far_side)
-    if finest > (told := max(round(sqrt(events)), 32)):
-        finest, why = told, f"so that a wall has a cell for each event; pixels would resolve {finest}"
+    # Of contracted space, a view sees less than half the width.
+    told = max(round(sqrt(events)) * (1 if far_side else 2), 32)
+    if finest > told:
+        finest, why = told, f"so that what is seen has a cell for each event; pixels would resolve {finest}"
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
