@@ -185,7 +185,7 @@ MODEL_CHANGES = {
     "most_hidden": 1e-3, "outliers_from": None, "contract": True, "precision": "bfloat16", "render_variance": 20.0,
     "broad_cells": 0,
 }  # fmt: skip
-POSE_CHANGES = {"smooth": False, "interpolation": "linear", "mode": "off", "keyframe_stride": 3}
+POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
 DATA_CHANGES = {
     "train_num_rays_per_batch": 64, "longest_pair": 3, "silent_share": 0.0, "refractory_us": 2000,
     "heldout_share": 0.2, "seed": 5,
