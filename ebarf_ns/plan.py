@@ -62,16 +62,15 @@ def plan_for(
     the paper's Eq. 6.
     """
     far_side = _far_side(scene, trajectory)
-    distance = far_side and far_side[0]
+    bounded, distance = far_side is not None, far_side and far_side[0]
     finest, why = _finest(scene.camera.fx, far_side)
     # Of contracted space, a view sees less than half the width.
-    told = max(round(sqrt(events)) * (1 if far_side else 2), 32)
+    told = max(round(sqrt(events)) * (1 if bounded else 2), 32)
     if finest > told:
         finest, why = told, f"so that what is seen has a cell for each event; pixels would resolve {finest}"
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
-    bounded = far_side is not None
     stride, straight = _stride(trajectory, scene.camera.fx, distance)
     precision = fastest_precision(device)
     rays = 16384 if device == "cuda" else 1024
