@@ -52,7 +52,7 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     estimated, true = _matched(estimate, reference)
     turned, straight = _rotations(estimated), _rotations(true)
     if alignment == "orientation":
-        scale = _align_by_orientation(estimated, true, (straight * turned.inv()).mean())
+        _, _, scale = _align_by_orientation(estimated, true)
     else:
         _, _, scale = _umeyama(estimated, true, correct_scale=alignment == "sim3")
     position_error, full_error = (
@@ -90,8 +90,9 @@ def _absolute_error(estimated: PosePath3D, true: PosePath3D, relation: metrics.P
     return error
 
 
-def _align_by_orientation(estimated: PosePath3D, true: PosePath3D, world: Rotation) -> float:
-    """Rotate, scale and shift ``estimated`` in place; returns the scale."""
+def _align_by_orientation(estimated: PosePath3D, true: PosePath3D) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotate, scale and shift ``estimated`` in place; returns the rotation, the shift after both, and the scale."""
+    world = (_rotations(true) * _rotations(estimated).inv()).mean()
     moved = world.apply(estimated.positions_xyz)
     offset, goal = moved - moved.mean(axis=0), true.positions_xyz - true.positions_xyz.mean(axis=0)
     still = 1e-12 * max(float(np.abs(moved).max()), float(np.abs(true.positions_xyz).max()), 1e-300)
@@ -100,10 +101,11 @@ def _align_by_orientation(estimated: PosePath3D, true: PosePath3D, world: Rotati
     scale = float((offset * goal).sum() / (offset**2).sum())
     if scale <= 0:
         raise EvaluationError("the trajectory moves against its reference, no positive scale aligns them")
+    shift = true.positions_xyz.mean(axis=0) - scale * moved.mean(axis=0)
     estimated.transform(se3(world.as_matrix(), np.zeros(3)))
     estimated.scale(scale)
-    estimated.transform(se3(np.eye(3), true.positions_xyz.mean(axis=0) - estimated.positions_xyz.mean(axis=0)))
-    return scale
+    estimated.transform(se3(np.eye(3), shift))
+    return world.as_matrix(), shift, scale
 
 
 def _rotations(path: PosePath3D) -> Rotation:
@@ -183,7 +185,7 @@ def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.n
     """The estimate's positions aligned by orientation and scale, for plots; as they are where that is not defined."""
     try:
         estimated, true = _matched(estimate, reference)
-        _align_by_orientation(estimated, true, (_rotations(true) * _rotations(estimated).inv()).mean())
+        _align_by_orientation(estimated, true)
     except EvaluationError:
         return estimate.poses.position.double().numpy()
     return np.asarray(estimated.positions_xyz)
@@ -222,8 +224,8 @@ def errors_under_each_alignment(
 def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_us: Int64[Tensor, "times"]) -> Poses:
     """The reference's poses at ``t_us``, moved into the estimate's world by the inverse of the sim3 alignment.
 
-    For frames outside the estimate's span. Raises :class:`EvaluationError` where the alignment is not defined, and for
-    times outside the reference's span.
+    For frames outside the estimate's span. Along a line the alignment is that by orientation. Raises
+    :class:`EvaluationError` where that is not defined either, and for times outside the reference's span.
     """
     outside = t_us[~within_span(t_us, reference.t_us)]
     if len(outside):
@@ -232,7 +234,10 @@ def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_
             f"{int(reference.t_us[-1])} us, the reference's span"
         )
     estimated, true = _matched(estimate, reference)
-    rotation, shift, scale = _umeyama(estimated, true, correct_scale=True)
+    try:
+        rotation, shift, scale = _umeyama(estimated, true, correct_scale=True)
+    except EvaluationError:
+        rotation, shift, scale = _align_by_orientation(estimated, true)
     poses = interpolate(reference.t_us, reference.poses, t_us)
     back = torch.from_numpy(Rotation.from_matrix(rotation.T).as_quat()[[3, 0, 1, 2]]).expand(len(t_us), 4)
     position = rotate(back, poses.position - torch.from_numpy(shift)) / float(scale)

@@ -113,8 +113,10 @@ def test_files_are_compared_with_every_alignment(tmp_path):
     assert comparison["matched"] == 20 and comparison["sim3"]["ate_m"] < 1e-6 and len(comparison["notes"]) == 2
 
 
-def test_reference_poses_are_found_in_the_estimates_world():
+@pytest.mark.parametrize("directions", [(1, 1, 1), (1, 0, 0)], ids=["wandering", "along a line"])
+def test_reference_poses_are_found_in_the_estimates_world(directions: tuple[int, int, int]):
     position, turn = wander()
+    position = position * directions
     world = Rotation.random(rng=np.random.default_rng(4))
     estimate = make(2 * world.apply(position) + 5, world * turn)
     reference = make(position, turn)

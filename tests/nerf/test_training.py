@@ -111,10 +111,7 @@ def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     lines = (scene / "trajectory.txt").read_text().splitlines()
     (scene / "trajectory.txt").write_text("\n".join(lines[:8]))
-    made = config(scene, tmp_path, steps=40)
-    # So few are smoothed to a straight line, along which no alignment to a reference is defined.
-    made.pipeline.model.camera_optimizer.smooth = False  # pyright: ignore[reportAttributeAccessIssue]
-    ready = trainer(made)
+    ready = trainer(config(scene, tmp_path, steps=40))
     ready.train()
     results = ready.pipeline.evaluate()
     assert results["frames"] == 2 and results["frames_outside_span"] == 1
