@@ -1,6 +1,6 @@
 """The README's picture from a run's folder: render beside frame, and the trajectory over time.
 
-python tools/figure.py RUN GROUNDTRUTH FRAME OUTPUT.png
+python tools/figure.py RUN SCENE/groundtruth.txt FRAME OUTPUT.png
 """
 
 import sys
