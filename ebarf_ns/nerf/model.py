@@ -25,8 +25,6 @@ from ebarf_ns.scene import ContrastThreshold, Scene
 
 # Log brightness is known up to a factor, which the field can follow: 0.1 or 0.6 in place of 0.25 cost 1 to 2 dB.
 _UNKNOWN_THRESHOLDS = ContrastThreshold(0.25, 0.25)
-# Steps after which silence tells the ratio of the thresholds; a field that is still empty has no brightness to compare.
-_TAKES_SHAPE = 1000
 T = TypeVar("T")
 
 
@@ -148,7 +146,6 @@ class EbarfModel(Model):
         self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
         self.display_range: Tensor
         self.random = torch.Generator()
-        self.has_taken_shape = False
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Two groups: fields, with what is learned of the sensor, and camera_opt for the keyframe corrections."""
@@ -162,7 +159,6 @@ class EbarfModel(Model):
         Each process of several has a seed of its own; what the first one remembers of densities goes for all.
         """
         self.random.manual_seed(seed * 1_000_003 + step)
-        self.has_taken_shape = step >= _TAKES_SHAPE
         self.renderer.begin_step(step, self.random)
         self.camera_optimizer.begin_step(step)
 
@@ -195,14 +191,9 @@ class EbarfModel(Model):
         if self.normalized:
             loss = normalized_loss(change, reported)
         else:
-            silent = batch["silent"]
-            if bool(silent.any()):
-                # Events lie on slopes. They find a ratio that is far off, but that slopes are rendered a little too
-                # gently passes for one too.
-                reported = torch.where(silent == self.has_taken_shape, reported, reported.detach())
             loss = threshold_loss(
                 change,
-                nearest_allowed(change, reported, silent, *outputs["sensor"]),
+                nearest_allowed(change, reported, batch["silent"], *outputs["sensor"]),
                 batch["variance"].to(change),
                 self.mean_threshold,
                 self.config.outliers_from,

@@ -17,9 +17,15 @@ def reported_change(
     threshold_on: Tensor | float,
     threshold_off: Tensor | float,
 ) -> Float[Tensor, "pairs"]:
-    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one."""
-    brighter = (event_count + polarity_sum) / 2
-    return brighter * threshold_on - (event_count - brighter) * threshold_off
+    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one.
+
+    To the thresholds, the gradient is of events that cancel one another alone: an on and an off event, that brightness
+    comes back, tell the ratio of the thresholds. The sum that is left does not: were its events to tell it, contrast
+    that renders still lack in bright and in dark places would pass for a ratio.
+    """
+    cancelled = (event_count - polarity_sum.abs()) / 2
+    left = polarity_sum.clamp(min=0) * threshold_on + polarity_sum.clamp(max=0) * threshold_off
+    return left.detach() + cancelled * (threshold_on - threshold_off)
 
 
 def nearest_allowed(

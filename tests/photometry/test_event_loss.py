@@ -16,6 +16,14 @@ def test_reported_change_counts_each_polarity_with_its_threshold():
     assert torch.allclose(change, torch.tensor([0.6, -0.6, 2 * 0.2 - 2 * 0.3]))
 
 
+def test_only_events_that_cancel_one_another_tell_the_thresholds():
+    thresholds = torch.tensor([0.2, 0.3], requires_grad=True)
+    polarity_sum, event_count = torch.tensor([3, -2, 0, 1, -2]), torch.tensor([3, 2, 4, 3, 6])
+    for one, cancelled in zip(reported_change(polarity_sum, event_count, *thresholds), [0, 0, 2, 1, 2], strict=True):
+        (gradient,) = torch.autograd.grad(one, thresholds, retain_graph=True)
+        assert gradient.tolist() == [cancelled, -cancelled]
+
+
 def test_threshold_loss_is_equation_five_in_thresholds():
     change = torch.tensor([0.5, -0.2])
     loss = threshold_loss(change, torch.tensor([0.25, -0.25]), torch.tensor([1, 1]), 0.25)
