@@ -52,6 +52,8 @@ class Simulation:
     rays_per_pixel: Literal[1, 4, 16] = 4
     sensor: SensorModel = field(default_factory=SensorModel)
     """What a pixel does."""
+    tell_thresholds: bool = True
+    """Let the scene say the contrast thresholds, which recordings seldom do."""
     keyframe_rate_hz: float = 20.0
     errors: TrajectoryErrors = field(default_factory=TrajectoryErrors)
     """How the initial trajectory differs from the true one."""
@@ -91,7 +93,9 @@ def simulate(
             camera=view.camera,
             groundtruth=temporary / "groundtruth.txt",
             frames=_write_frames(_view(place, settings, _FRAME_RAYS), settings, end_us, temporary),
-            contrast_threshold=ContrastThreshold(settings.sensor.threshold_on, settings.sensor.threshold_off),
+            contrast_threshold=ContrastThreshold(settings.sensor.threshold_on, settings.sensor.threshold_off)
+            if settings.tell_thresholds
+            else None,
             bounds=_bounds(place.room, settings.errors.scale),
         )
         write_scene(scene)
