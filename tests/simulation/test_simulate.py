@@ -84,6 +84,12 @@ def test_every_scene_of_the_catalogue_can_be_simulated(tmp_path: Path, name: Sce
     assert (truth.poses.position.numpy() > lower).all() and (truth.poses.position.numpy() < upper).all()
 
 
+def test_a_scene_may_keep_its_thresholds_to_itself(tmp_path: Path):
+    told, untold = (simulate(replace(SMALL, tell_thresholds=told), tmp_path / f"told {told}") for told in (True, False))
+    assert told.contrast_threshold and untold.contrast_threshold is None
+    assert told.events.read_bytes() == untold.events.read_bytes()
+
+
 def test_a_slide_is_a_line_and_an_orbit_looks_at_its_middle(tmp_path: Path):
     t_us = np.linspace(0, 2e6, 50)
     slide, orbit = CATALOGUE["slide"](3), CATALOGUE["orbit"](3)
