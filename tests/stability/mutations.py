@@ -86,7 +86,7 @@ MUTATIONS = (
              "test_photometry.py::test_case_17_the_normalised_loss_is_smooth_at_any_size"),
     Mutation(17, LOSS, "unit = change / (change.square().sum() + delta**2).sqrt()", "unit = change / delta",
              "test_photometry.py::test_case_17_the_normalised_loss_does_not_know_the_scale"),
-    Mutation(18, LOSS, "threshold_on - (event_count - brighter)", "threshold_on + (event_count - brighter)",
+    Mutation(18, LOSS, "+ polarity_sum.clamp(max=0)", "- polarity_sum.clamp(max=0)",
              "test_photometry.py::test_case_18_which_end_comes_first_does_not_matter"),
     Mutation(19, LOSS, NO_INFORMATION, "if False:",
              "test_photometry.py::test_case_19_batches_without_information_change_nothing"),
