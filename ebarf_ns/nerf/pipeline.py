@@ -52,7 +52,7 @@ class EbarfPipeline(VanillaPipeline):
 
     def record_cost(self, train_seconds: float, event_pairs: int) -> None:
         """What the model has cost so far; kept in its checkpoints, so that ns-eval can say it."""
-        self.cost.copy_(torch.tensor([train_seconds, event_pairs]))
+        self.cost.copy_(torch.tensor([train_seconds, event_pairs], dtype=self.cost.dtype))
 
     def _check_references(self) -> None:
         """Read what evaluation will need, so that a mistake in it does not end a run halfway."""

@@ -7,6 +7,7 @@ from functools import reduce
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
+from pickle import UnpicklingError
 from time import monotonic
 from typing import Any
 
@@ -49,7 +50,7 @@ _LEAST = {
     "pipeline.model.grid_finest": 2,
     "pipeline.model.grid_table_size_log2": 1,
     "pipeline.model.broad_cells": 0,
-    "pipeline.model.density_cells": 1,
+    "pipeline.model.density_cells": 3,
     "pipeline.model.coarse_samples": 1,
     "pipeline.model.uniform_share": 0,
     "pipeline.model.most_hidden": 1e-6,
@@ -324,6 +325,8 @@ class EbarfTrainer(Trainer):
         # What says where a run lies, not what it does.
         places = {"timestamp", "output_dir", "experiment_name", "load_dir", "load_step", "load_checkpoint", "data"}
         configuration = {key: value for key, value in asdict(self.config).items() if key not in places}
+        datamanager = configuration["pipeline"]["datamanager"]
+        datamanager["data"] = datamanager["dataparser"]["data"] = None
         return {
             "versions": {name: version(name) for name in ("ebarf_ns", "nerfstudio", "torch", "numpy")},
             "method": self.config.method_name,
@@ -372,8 +375,13 @@ class EbarfTrainer(Trainer):
         return self.checkpoint_dir / f"step-{self._last_step():09d}.ckpt"
 
     def _load_checkpoint(self) -> None:
-        super()._load_checkpoint()
         path = self._loaded_path()
+        try:
+            super()._load_checkpoint()
+        except (RuntimeError, KeyError, ValueError, EOFError, UnpicklingError) as error:
+            said = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
+            expected = "expected a run's checkpoint, with the flags it was made by"
+            raise TrainingError(f"{path or self.config.load_dir}: cannot go on from it ({said}), {expected}") from None
         if path is not None:
             state = torch.load(path, map_location="cpu")
             ours = state.get("ebarf", {})

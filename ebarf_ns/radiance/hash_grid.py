@@ -123,9 +123,12 @@ def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
 
 @lru_cache
 def _importable(name: str) -> bool:
-    """Whether it is there and fits this machine: tiny-cuda-nn raises errors of its own on GPUs it was not built for."""
+    """Whether it is there and fits this machine: tiny-cuda-nn raises errors of its own on GPUs it was not built for,
+    and Triton's driver is compiled when it is first asked."""
     try:
-        import_module(name)
+        module = import_module(name)
+        if name == "triton":
+            module.runtime.driver.active.get_current_device()
     except Exception:
         return False
     return True

@@ -1,6 +1,7 @@
 """The hash encoding on a GPU: one program a block of points, which walks the levels and keeps its sums in registers.
 
-Triton comes with torch and compiles at first use; nothing has to be built beforehand. With ``TRITON_INTERPRET=1`` set
+Triton comes with torch and compiles at first use, its launcher by the system's C compiler; nothing has to be built
+beforehand. With ``TRITON_INTERPRET=1`` set
 before the import, the same kernels run on a CPU, slowly: that is how machines without a GPU test them.
 """
 
@@ -42,7 +43,8 @@ class _Encoding(torch.autograd.Function):
         encoded = torch.empty(count, len(levels[0]) * features, device=point.device)
         if count:
             grid = (triton.cdiv(count, _BLOCK),)
-            _forward[grid](point, table, *levels, encoded, count, len(levels[0]), features, _BLOCK)
+            with torch.cuda.device_of(point):
+                _forward[grid](point, table, *levels, encoded, count, len(levels[0]), features, _BLOCK)
         return encoded
 
     @staticmethod
@@ -54,7 +56,8 @@ class _Encoding(torch.autograd.Function):
         if count:
             grid = (triton.cdiv(count, _BLOCK),)
             outputs = (gradients[0].contiguous(), table_gradient, point_gradient)
-            _backward[grid](point, table, *levels, *outputs, count, len(levels[0]), features, _BLOCK)
+            with torch.cuda.device_of(point):
+                _backward[grid](point, table, *levels, *outputs, count, len(levels[0]), features, _BLOCK)
         return point_gradient if ctx.needs_input_grad[0] else None, table_gradient, *(None for _ in levels)
 
 

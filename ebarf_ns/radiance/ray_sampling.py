@@ -95,8 +95,9 @@ class DensityGrid(nn.Module):
     @torch.no_grad()
     def remember(self, point: Float[Tensor, "points 3"], density: Float[Tensor, "points"]) -> None:
         """Keep up with what rays come across, which is where it matters."""
-        cells, densities = self._cell(point).split(_IN_ORDER), density.to(self.density).split(_IN_ORDER)
-        # Pieces so small that torch writes them in order: of several points in a cell, always the last one counts.
+        # Pieces so small that a CPU writes them in order: of several points in a cell, always the last one counts.
+        piece = max(len(point), 1) if point.is_cuda else _IN_ORDER
+        cells, densities = self._cell(point).split(piece), density.to(self.density).split(piece)
         for cell, seen in zip(cells, densities, strict=True):
             self.density[cell] = self.density[cell].lerp(seen, _SHARE_OF_SEEN)
 

@@ -288,6 +288,28 @@ def test_a_checkpoint_that_is_none_is_named(
     assert stopped.value.code == 2 and "step-000000007.ckpt: is no file, expected" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("what", ["text", "of other flags"])
+def test_what_cannot_be_gone_on_from_ends_in_one_line(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
+):
+    made = config(tiny_scene, tmp_path, steps=1)
+    path = tmp_path / "step-000000007.ckpt"
+    if what == "text":
+        path.write_text("no checkpoint")
+    else:
+        first = trainer(made)
+        first.train()
+        path = first.checkpoint_dir / "step-000000000.ckpt"
+        made = config(tiny_scene, tmp_path / "second")
+        made.pipeline.model.grid_features = 2  # pyright: ignore[reportAttributeAccessIssue]
+    made.load_checkpoint = path
+    with pytest.raises(SystemExit) as stopped:
+        trainer(made)
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1
+    assert f"{path.name}: cannot go on from it" in said and "with the flags it was made by" in said
+
+
 def test_a_step_in_which_no_group_is_due_is_not_a_broken_one():
     optimizers = GuardedOptimizers({}, {})
     optimizers.optimizer_scaler_step_some(torch.amp.GradScaler(enabled=False), [])
