@@ -15,6 +15,7 @@ from ebarf_ns.scene import Frame
 
 _DARKEST = 1e-3
 _SMALLEST_FOR_SSIM, _SMALLEST_FOR_LPIPS = 11, 64
+_FRAMES_TOO_SMALL = f"LPIPS left out: frames are smaller than {_SMALLEST_FOR_LPIPS} pixels"
 
 
 def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
@@ -120,8 +121,10 @@ def image_errors(
 
 
 def lpips_note(evaluation: dict[str, Any]) -> str | None:
-    """The same of an evaluation on record; None where it has LPIPS, or no frames at all."""
-    return lpips_missing() if "psnr" in evaluation and evaluation.get("lpips") is None else None
+    """Why an evaluation on record has no LPIPS, in a sentence; None where it has, or has no frames at all."""
+    if "psnr" not in evaluation or evaluation.get("lpips") is not None:
+        return None
+    return lpips_missing() or _FRAMES_TOO_SMALL
 
 
 def lpips_missing(reference: Sequence[Float[np.ndarray, "height width"]] = ()) -> str | None:
@@ -131,5 +134,5 @@ def lpips_missing(reference: Sequence[Float[np.ndarray, "height width"]] = ()) -
         fetch = "import torchvision; torchvision.models.alexnet(weights='DEFAULT')"
         return f'LPIPS left out: AlexNet\'s weights are not at {weights}; python -c "{fetch}" fetches them'
     if any(min(image.shape) < _SMALLEST_FOR_LPIPS for image in reference):
-        return f"LPIPS left out: frames are smaller than {_SMALLEST_FOR_LPIPS} pixels"
+        return _FRAMES_TOO_SMALL
     return None

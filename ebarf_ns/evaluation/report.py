@@ -22,6 +22,7 @@ _CURVES = {
     "heldout_event_loss": "unexplained share of held-out events",
     "psnr": "PSNR [dB]",
     "ate_m": "position error, sim3 [m]",
+    "ate_m_orientation": "position error, by orientation [m]",
     "rotation_deg": "rotation error [deg]",
 }
 
@@ -86,6 +87,9 @@ def _trajectory_figure(run: Path, groundtruth: Path | None) -> Figure:
 
 def _curves_figure(evaluations: list[dict[str, Any]]) -> Figure:
     names = [name for name in _CURVES if any(record.get(name) is not None for record in evaluations)]
+    if "ate_m" in names:
+        # Of motion along a line there is no other than by orientation.
+        names.remove("ate_m_orientation")
     count = max(1, len(names))
     figure, axes = plt.subplots(1, count, figsize=(3.6 * count, 3.2), squeeze=False)
     for axis, name in zip(axes[0], names, strict=False):
