@@ -1,7 +1,8 @@
 """Rotations as unit quaternions (w, x, y, z): exponential, product, interpolation, all finite with finite gradients.
 
-No function divides by an angle or calls acos: small angles go through Taylor series selected by the double-where
-idiom (the unused branch sees a harmless argument, so that its gradient is never NaN), larger ones through atan2.
+No function calls acos or divides by an angle that may be 0: small angles go through Taylor series selected by the
+double-where idiom (the unused branch sees a harmless argument, so that its gradient is never NaN), larger ones through
+atan2.
 """
 
 from __future__ import annotations

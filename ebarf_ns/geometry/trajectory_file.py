@@ -68,9 +68,9 @@ def _parse_pose(place: str, fields: list[str]) -> tuple[int, list[float]]:
     return t_us, row
 
 
-def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write poses as TUM text, times to the microsecond; ``comment`` goes before the column names."""
-    lines = [f"# {line}" for line in comment.splitlines()] + ["# timestamp[s] tx ty tz qx qy qz qw"]
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write poses as TUM text, times to the microsecond."""
+    lines = ["# timestamp[s] tx ty tz qx qy qz qw"]
     position, quat_wxyz = trajectory.poses.position.double(), trajectory.poses.quat_wxyz.double()
     for t_us, p, (w, *xyz) in zip(trajectory.t_us.tolist(), position.tolist(), quat_wxyz.tolist(), strict=True):
         numbers = " ".join(f"{value:.9f}" for value in (*p, *xyz, w))

@@ -19,6 +19,7 @@ IntensityRange = Literal["unit", "positive"]
 Precision = Literal["float32", "bfloat16"]
 # Points per pass through the MLPs on a CPU: their activations stay in cache.
 _CHUNK = 16384
+_HIDDEN = 64
 _MAX_LOG_DENSITY = 12.0
 
 
@@ -83,7 +84,6 @@ class RadianceField(nn.Module):
         bounded: bool,
         view_dependent: bool = False,
         intensity_range: IntensityRange = "positive",
-        hidden: int = 64,
         precision: Precision = "float32",
         broad_cells: int = 0,
     ):
@@ -94,9 +94,9 @@ class RadianceField(nn.Module):
         self.precision = precision
         self.grid = HashGrid(shape)
         self.broad = BroadBrightness(broad_cells) if broad_cells else None
-        self.trunk = nn.Sequential(nn.Linear(shape.width, hidden), nn.ReLU(), nn.Linear(hidden, 16))
+        self.trunk = nn.Sequential(nn.Linear(shape.width, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, 16))
         inputs = 15 + (8 if view_dependent else 0)
-        self.head = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+        self.head = nn.Sequential(nn.Linear(inputs, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, 1))
 
     def _unit_cube(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
         return (point + 1) / 2 if self.bounded else (contract(point) + 2) / 4

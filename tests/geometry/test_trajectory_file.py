@@ -34,7 +34,7 @@ def test_written_poses_read_back(tmp_path_factory: pytest.TempPathFactory, times
     quat = torch.from_numpy(Rotation.random(len(times), rng=np.random.default_rng(0)).as_quat())[:, [3, 0, 1, 2]]
     poses = Poses(torch.randn(len(times), 3, dtype=torch.float64), quat)
     path = tmp_path_factory.mktemp("tum") / "poses.txt"
-    write_tum(path, Trajectory(torch.tensor(times), poses), comment="two\nlines")
+    write_tum(path, Trajectory(torch.tensor(times), poses))
     back = read_tum(path)
     assert back.t_us.tolist() == times
     assert torch.allclose(back.poses.position, poses.position, atol=1e-8)
