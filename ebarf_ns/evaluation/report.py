@@ -87,9 +87,8 @@ def _trajectory_figure(run: Path, groundtruth: Path | None) -> Figure:
 
 def _curves_figure(evaluations: list[dict[str, Any]]) -> Figure:
     names = [name for name in _CURVES if any(record.get(name) is not None for record in evaluations)]
-    if "ate_m" in names:
-        # Of motion along a line there is no other than by orientation.
-        names.remove("ate_m_orientation")
+    # Of motion along a line there is no other than by orientation.
+    names = [name for name in names if name != "ate_m_orientation" or "ate_m" not in names]
     count = max(1, len(names))
     figure, axes = plt.subplots(1, count, figsize=(3.6 * count, 3.2), squeeze=False)
     for axis, name in zip(axes[0], names, strict=False):

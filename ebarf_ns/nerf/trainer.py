@@ -379,9 +379,11 @@ class EbarfTrainer(Trainer):
         try:
             super()._load_checkpoint()
         except (RuntimeError, KeyError, ValueError, EOFError, UnpicklingError) as error:
-            said = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
+            # Of what is no pickle, torch says how to be less careful with it.
+            unreadable = isinstance(error, (UnpicklingError, EOFError)) or not str(error)
+            said = "it is no checkpoint" if unreadable else str(error).splitlines()[-1].strip()
             expected = "expected a run's checkpoint, with the flags it was made by"
-            raise TrainingError(f"{path or self.config.load_dir}: cannot go on from it ({said}), {expected}") from None
+            raise TrainingError(f"{path}: cannot go on from it ({said}), {expected}") from None
         if path is not None:
             state = torch.load(path, map_location="cpu")
             ours = state.get("ebarf", {})

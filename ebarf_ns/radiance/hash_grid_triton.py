@@ -1,8 +1,8 @@
 """The hash encoding on a GPU: one program a block of points, which walks the levels and keeps its sums in registers.
 
 Triton comes with torch and compiles at first use, its launcher by the system's C compiler; nothing has to be built
-beforehand. With ``TRITON_INTERPRET=1`` set
-before the import, the same kernels run on a CPU, slowly: that is how machines without a GPU test them.
+beforehand. With ``TRITON_INTERPRET=1`` set before the import, the same kernels run on a CPU, slowly: that is how
+machines without a GPU test them.
 """
 
 # Triton's language is not Python to a type checker.
