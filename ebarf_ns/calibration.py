@@ -15,6 +15,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import SceneError
+from ebarf_ns.files import opened_npz
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera, CameraModel
 
 _MODELS: dict[str, CameraModel] = {
@@ -44,7 +45,8 @@ def read_calibration(path: Path, which: str | None = None, sensor_size: tuple[in
     if which is None and len(cameras) == 1:
         return next(iter(cameras.values()))
     if which not in cameras:
-        raise SceneError(f"{path}: camera {which or 'not chosen'}, expected one of {', '.join(cameras) or 'none'}")
+        names = ", ".join(cameras) or "none"
+        raise SceneError(f"{path}: camera {which or 'not chosen'}, expected --camera-name with one of {names}")
     return cameras[which]
 
 
@@ -96,7 +98,8 @@ def _camera(entry: Mapping[str, Any], size: tuple[int, int] | None) -> Camera:
     if name not in _MODELS:
         raise ValueError(f"distortion model {name!r}, expected one of {', '.join(filter(None, _MODELS))}")
     model = _MODELS[name]
-    if not any(distortion):
+    # Without any coefficient, an equidistant lens is still no pinhole.
+    if model != "equidistant" and not any(distortion):
         model, distortion = "pinhole", ()
     if len(distortion) not in COEFFICIENTS[model]:
         raise ValueError(f"{len(distortion)} coefficients for {model}, expected {COEFFICIENTS[model]}")
@@ -201,7 +204,7 @@ def _m3ed(path: Path) -> dict[str, Calibrated]:
 
 
 def _robust_e_nerf(path: Path) -> Calibrated:
-    with np.load(path, allow_pickle=False) as file:
+    with opened_npz(path) as file:
         content = {name: file[name] for name in file.files}
     try:
         matrix = np.asarray(content["intrinsics"], float)

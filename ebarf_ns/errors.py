@@ -43,9 +43,14 @@ class BenchmarkError(EbarfError):
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turn an :class:`EbarfError` into one line on standard error and exit code 2, without a traceback."""
+    """Turn an :class:`EbarfError`, or what the system refuses, into one line on standard error and exit code 2."""
     try:
         yield
-    except EbarfError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (EbarfError, OSError) as error:
+        print(f"error: {error if isinstance(error, EbarfError) else _what_the_system_says(error)}", file=sys.stderr)
         raise SystemExit(2) from error
+
+
+def _what_the_system_says(error: OSError) -> str:
+    said = error.strerror or " ".join(str(error).split())
+    return f"{error.filename}: {said}" if error.filename else said

@@ -6,6 +6,11 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ebarf_ns.errors import EbarfError
 
 
 @contextmanager
@@ -28,6 +33,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder to fill; it becomes ``path`` (replacing it) when the block ends without an exception."""
+    path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
@@ -38,6 +44,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def opened_npz(path: Path) -> Iterator[Any]:
+    """The arrays of an npz file, by name; whatever a damaged one makes the libraries raise is a ValueError."""
+    try:
+        with np.load(path) as file:
+            yield file
+    except (EbarfError, OSError):
+        raise
+    except Exception as error:
+        raise ValueError(f"not a whole npz file of plain arrays ({error})") from None
 
 
 def _umask() -> int:

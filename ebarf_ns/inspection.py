@@ -108,7 +108,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         bounded=scene.bounds is not None,
         frames=len(scene.frames),
         groundtruth=scene.groundtruth is not None,
-        distortion=camera.model if any(camera.distortion) else "none",
+        distortion=camera.model if camera.distortion else "none",
         plan=plan_for(scene, smoothed(trajectory), events, "cuda" if torch.cuda.is_available() else "cpu"),
     )
 

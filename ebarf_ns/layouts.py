@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from ebarf_ns.calibration import Calibrated, pose_matrix, read_calibration, read_cameras
 from ebarf_ns.errors import SceneError
-from ebarf_ns.events.readers.arrays import read_npy_folder, read_npz
+from ebarf_ns.events.readers.arrays import read_npy, read_npz
 from ebarf_ns.events.readers.hdf5 import read_hdf5
 from ebarf_ns.events.readers.text import read_text
 from ebarf_ns.events.source import Source
+from ebarf_ns.files import opened_npz
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
@@ -53,26 +54,47 @@ class Ingredients:
     notes: list[str] = field(default_factory=list)
 
 
-def ecd(folder: Path, sensor_size: tuple[int, int] = (240, 180)) -> Ingredients:
+@dataclass(frozen=True)
+class Given:
+    """What somebody says of a dataset's folder, or wants of it."""
+
+    camera: Path | None = None
+    """A calibration file in place of the folder's own."""
+    sensor_size: tuple[int, int] | None = None
+    part: str | None = None
+    """Of two event cameras, which."""
+    frames: bool = True
+    """Whether pictures are looked for."""
+
+
+NOTHING_GIVEN = Given()
+
+
+def ecd(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     """The event camera dataset (Mueggler et al. 2017): events.txt, calib.txt, groundtruth.txt, images.txt."""
-    camera = read_calibration(folder / "calib.txt", sensor_size=sensor_size).camera
+    camera = None
+    if given.camera is None:
+        camera = read_calibration(folder / "calib.txt", sensor_size=given.sensor_size or (240, 180)).camera
     groundtruth, notes = None, []
     if (folder / "groundtruth.txt").is_file():
         groundtruth, notes = read_trajectory(folder / "groundtruth.txt", TrajectoryFormat("s", "xyzw"))
     # The DAVIS' frames are linear up to its sensor's offset.
-    frames = tuple(
-        FrameFile(path, t_us, camera, np.eye(4), "linear") for t_us, path in _listed(folder / "images.txt", "s")
-    )
+    listed = _listed(folder / "images.txt", "s") if given.frames else []
+    frames = tuple(FrameFile(path, t_us, None, np.eye(4), "linear") for t_us, path in listed)
     return Ingredients(lambda: read_text(folder / "events.txt", "s"), camera, groundtruth, frames, notes=notes)
 
 
-def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) -> Ingredients:
+def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     """TUM-VIE (Klenk et al. 2021): ``*events_left.h5``, mocap_data.txt and the calibrations A or B beside them.
 
-    The marker's poses become the event camera's by T_mocap_marker · T_imu_marker⁻¹ · T_imu_cam.
+    The marker's poses become the event camera's by T_mocap_marker · T_imu_marker⁻¹ · T_imu_cam. ``part`` is left or
+    right, left where not given.
     """
+    side = given.part or "left"
+    if side not in _EVENT_CAMERAS:
+        raise SceneError(f"{folder}: part {side!r}, expected one of {', '.join(_EVENT_CAMERAS)}")
     events = _only(folder, f"*events_{side}.h5")
-    cameras = calibration or _only(folder, "camera-calibration*.json")
+    cameras = given.camera or _only(folder, "camera-calibration*.json")
     marker = cameras.parent / f"mocap-imu-{cameras.name.removeprefix('camera-')}"
     event_camera = read_calibration(cameras, _EVENT_CAMERAS[side])
     grey_camera = read_calibration(cameras, _GREY_CAMERAS[side])
@@ -80,7 +102,7 @@ def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) ->
     mocap = _at_most_one(folder, "**/mocap_data.txt")
     if mocap and marker.is_file():
         marker_path, notes = read_trajectory(mocap, TrajectoryFormat("us", "xyzw"))
-        imu_from_marker = pose_matrix(json.loads(marker.read_text(encoding="utf-8"))["value0"]["T_imu_marker"])
+        imu_from_marker = _imu_from_marker(marker)
         groundtruth = _moved(marker_path, np.linalg.inv(imu_from_marker) @ _rig(event_camera, cameras))
     elif mocap:
         notes.append(
@@ -88,7 +110,7 @@ def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) ->
         )
     event_from_grey = np.linalg.inv(_rig(event_camera, cameras)) @ _rig(grey_camera, cameras)
     frames = []
-    for stamps in folder.glob(f"**/image_timestamps_{side}.txt"):
+    for stamps in folder.glob(f"**/image_timestamps_{side}.txt") if given.frames else ():
         images = sorted((stamps.parent / f"{side}_images").glob("*.jpg"))
         times = _times(stamps, len(images))
         frames = [
@@ -100,49 +122,47 @@ def tumvie(folder: Path, side: str = "left", calibration: Path | None = None) ->
     )
 
 
-def eds(folder: Path, cameras: Path | None = None) -> Ingredients:
+def eds(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     """EDS (Hidalgo-Carrió et al. 2022): events.h5 with its columns at top level, poses of the event camera.
 
-    The frames, images/ with images_timestamps.txt [us], are another camera's: ``cameras`` says where that is, as a
+    The frames, images/ with images_timestamps.txt [us], are another camera's: ``camera`` says where that is, as a
     kalibr file with cam0 (frames) and cam1 (events).
     """
-    groundtruth, notes, frames = None, [], []
+    cameras, groundtruth, notes, frames = given.camera, None, [], []
     poses, stamps = folder / "stamped_groundtruth.txt", folder / "images_timestamps.txt"
     if poses.is_file():
         groundtruth, notes = read_trajectory(poses, TrajectoryFormat("s", "xyzw"))
     known = read_cameras(cameras) if cameras and cameras.suffix == ".yaml" else {}
-    if stamps.is_file() and "cam0" in known and "cam1" in known:
+    stamped = given.frames and stamps.is_file()
+    if stamped and "cam0" in known and "cam1" in known:
         event_from_frame = np.linalg.inv(_rig(known["cam1"], cameras)) @ _rig(known["cam0"], cameras)
         images = sorted((folder / "images").glob("*.png"))
         frames = [
             FrameFile(path, t_us, known["cam0"].camera, event_from_frame, "srgb")
             for path, t_us in zip(images, _times(stamps, len(images)), strict=True)
         ]
-    elif stamps.is_file():
+    elif stamped:
         notes.append("the frames are another camera's; without a --camera file that has both, they are left out")
     return Ingredients(lambda: read_hdf5(folder / "events.h5"), None, groundtruth, tuple(frames), notes=notes)
 
 
-def esim(folder: Path) -> Ingredients:
-    """ESIM's and E-NeRF's synthetic recordings: events/*.npy, *poses_all*.txt (ns), images with image_stamps_ns.txt."""
+def esim(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
+    """ESIM's and E-NeRF's synthetic recordings: events/*.npy, *poses_all*.txt (ns); images are left where they are."""
     groundtruth, notes = None, []
     poses = _at_most_one(folder, "**/*poses_all*.txt")
     if poses:
         groundtruth, notes = read_trajectory(poses, TrajectoryFormat("ns", "xyzw"))
     events = folder / "events" if (folder / "events").is_dir() else folder
-    return Ingredients(lambda: read_npy_folder(events), None, groundtruth, notes=notes)
+    return Ingredients(lambda: read_npy(events), None, groundtruth, notes=notes)
 
 
-def robust_e_nerf(folder: Path) -> Ingredients:
+def robust_e_nerf(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     """Robust e-NeRF (Low & Lee 2023): raw_events.npz, camera_poses.npz, camera_calibration.npz."""
     calibration = folder / "camera_calibration.npz"
-    camera = read_calibration(calibration).camera
-    with np.load(calibration, allow_pickle=False) as file:
-        on, off = (float(file[f"{sign}_contrast_threshold"]) for sign in ("pos", "neg"))
+    camera = read_calibration(calibration).camera if given.camera is None else None
+    threshold = _contrast_threshold(calibration) if calibration.is_file() else None
     groundtruth, notes = read_trajectory(folder / "camera_poses.npz")
-    return Ingredients(
-        lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, (), ContrastThreshold(on, off), notes
-    )
+    return Ingredients(lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, (), threshold, notes)
 
 
 LAYOUTS: dict[Layout, Callable[..., Ingredients]] = {
@@ -171,6 +191,23 @@ def _moved(trajectory: Trajectory, body_from_camera: np.ndarray) -> Trajectory:
     count = len(trajectory.t_us)
     local = Poses(torch.from_numpy(body_from_camera[:3, 3]).expand(count, 3), torch.from_numpy(turn).expand(count, 4))
     return Trajectory(trajectory.t_us, trajectory.poses.compose(local))
+
+
+def _contrast_threshold(path: Path) -> ContrastThreshold:
+    try:
+        with opened_npz(path) as file:
+            return ContrastThreshold(*(float(file[f"{sign}_contrast_threshold"]) for sign in ("pos", "neg")))
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: {error}, expected pos_contrast_threshold and neg_contrast_threshold") from None
+
+
+def _imu_from_marker(path: Path) -> np.ndarray:
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        return pose_matrix(content["value0"]["T_imu_marker"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise SceneError(f"{path}: cannot be read ({reason}), expected TUM-VIE's T_imu_marker") from None
 
 
 def _rig(camera: Calibrated, path: Path | None) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -18,16 +19,15 @@ from ebarf_ns.calibration import read_calibration
 from ebarf_ns.errors import SceneError, TrajectoryError
 from ebarf_ns.evaluation.compare import read_by_reference
 from ebarf_ns.events.intake import Intake, hot_pixels, take_in
-from ebarf_ns.events.readers.text import TimeUnit
 from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised
-from ebarf_ns.events.source import Source
+from ebarf_ns.events.source import Source, TimeUnit
 from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import write_tum
 from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, order_is_known, read_trajectory
-from ebarf_ns.layouts import LAYOUTS, FrameFile, Ingredients, Layout, recognised_layout
+from ebarf_ns.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -43,21 +43,22 @@ class ProcessSettings:
     trajectory: Path | None = None
     """Initial keyframe poses; the reference itself where not given."""
     trajectory_format: TrajectoryFormat = field(default_factory=TrajectoryFormat)
-    """What that file does not say of itself."""
+    """What that file does not say of itself; of the reference where there is no other trajectory."""
     groundtruth: Path | None = None
     """Reference poses, where the dataset's folder has none; of the event camera, on its clock."""
     camera: Path | None = None
-    """A calibration file, where the dataset's folder has none."""
+    """A calibration file, in place of the one in the dataset's folder."""
     camera_name: str | None = None
-    """Which camera of that file."""
+    """Which camera of that file; TUM-VIE's event cameras are known."""
     sensor_size: tuple[int, int] | None = None
     """Columns and rows, where neither recording nor calibration say so."""
     contrast_threshold: tuple[float, float] | None = None
     """On and off, where known."""
     part: str | None = None
-    """The group of an HDF5 file or the topic of a bag that has the events, where several have."""
+    """The group of an HDF5 file or the topic of a bag that has the events, where several have; of TUM-VIE's event
+    cameras left or right."""
     event_time_unit: TimeUnit | None = None
-    """Of the events in text and npz files, where they do not say so."""
+    """Of the events in text, npz and HDF5 files, where they do not say so."""
     events: Intake = field(default_factory=Intake)
     """What to do with events."""
     bounds: Bounds | None = None
@@ -79,10 +80,22 @@ def process(
 
     Raises the error of whatever room finds something wrong, in which case there is no folder.
     """
+    _check(settings)
     with _unpacked(source) as unpacked:
         ingredients = _ingredients(format, unpacked, settings)
         with whole_folder(output) as folder:
             return _assemble(ingredients, settings, folder, progress)
+
+
+def _check(settings: ProcessSettings) -> None:
+    """Raise :class:`SceneError` for numbers that no scene can have, before anything is read."""
+    on, off = settings.contrast_threshold or (None, None)
+    numbers = {"--contrast-threshold ON": on, "--contrast-threshold OFF": off, "--farthest": settings.farthest}
+    for flag, value in numbers.items():
+        if value is not None and not 0 < value < np.inf:
+            raise SceneError(f"{flag} is {value}, expected a finite number above 0")
+    if settings.bounds and not (np.isfinite(settings.bounds).all() and np.less(*settings.bounds).all()):
+        raise SceneError(f"--bounds is {settings.bounds}, expected a first corner below the second on every axis")
 
 
 @contextmanager
@@ -91,13 +104,15 @@ def _unpacked(source: Path) -> Iterator[Path]:
     if source.suffix != ".zip":
         yield source
         return
-    try:
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(source) as archive:
-            archive.extractall(folder)
-            inside = list(Path(folder).iterdir())
-            yield inside[0] if len(inside) == 1 and inside[0].is_dir() else Path(folder)
-    except (OSError, zipfile.BadZipFile) as error:
-        raise SceneError(f"{source}: not a whole zip file ({error})") from None
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            with zipfile.ZipFile(source) as archive:
+                archive.extractall(folder)
+        except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+            raise SceneError(f"{source}: not a whole zip file that can be opened ({error})") from None
+        # Some systems leave notes of their own beside the dataset's folder.
+        inside = [one for one in Path(folder).iterdir() if one.name != "__MACOSX" and not one.name.startswith(".")]
+        yield inside[0] if len(inside) == 1 and inside[0].is_dir() else Path(folder)
 
 
 def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
@@ -107,18 +122,17 @@ def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ing
         layout: Layout = recognised_layout(source) if format == "auto" else format  # pyright: ignore[reportAssignmentType]
         if not source.is_dir():
             raise SceneError(f"{source}: a file, expected the folder of a {layout} recording")
-        if layout == "ecd" and settings.sensor_size:
-            return LAYOUTS[layout](source, settings.sensor_size)
-        if layout == "eds":
-            return LAYOUTS[layout](source, settings.camera)
-        return LAYOUTS[layout](source)
+        return LAYOUTS[layout](source, Given(settings.camera, settings.sensor_size, settings.part, settings.frames))
     known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]
     known = known or recognised(source)
     opened = lambda: open_recording(source, known, settings.part, settings.event_time_unit)  # noqa: E731
-    return Ingredients(opened, frames=_frames_within(source, known, opened) if settings.frames else ())
+    frames = _frames_within(source, known, opened, settings.part) if settings.frames else ()
+    return Ingredients(opened, frames=frames)
 
 
-def _frames_within(source: Path, format: RecordingFormat, opened: Callable[[], Source]) -> Iterator[FrameFile]:
+def _frames_within(
+    source: Path, format: RecordingFormat, opened: Callable[[], Source], part: str | None
+) -> Iterator[FrameFile]:
     """The pictures that a DAVIS takes with the pixels of its events."""
     if format == "aedat4":
         from ebarf_ns.events.readers.aedat4 import read_aedat4_frames
@@ -127,7 +141,7 @@ def _frames_within(source: Path, format: RecordingFormat, opened: Callable[[], S
     elif format == "bag":
         from ebarf_ns.events.readers.bags import read_bag_frames
 
-        pictures = read_bag_frames(source, opened().sensor_size or (0, 0))
+        pictures = read_bag_frames(source, opened().sensor_size or (0, 0), part)
     else:
         return
     for t_us, picture in pictures:
@@ -146,7 +160,10 @@ def _assemble(
     report = take_in(source, size, intake, folder / "events.h5", hot, progress)
     groundtruth = ingredients.groundtruth
     if settings.groundtruth:
-        groundtruth, said = read_trajectory(settings.groundtruth, settings.trajectory_format)
+        known = settings.trajectory_format
+        # What the flags say is of the other file then, but for the times, which are of those that have none.
+        known = TrajectoryFormat(pose_times=known.pose_times) if settings.trajectory else known
+        groundtruth, said = read_trajectory(settings.groundtruth, known)
         notes += said
     initial = groundtruth
     if settings.trajectory:
@@ -184,7 +201,7 @@ def _assemble(
 
 def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int, int] | None) -> Camera:
     camera = ingredients.camera
-    if settings.camera:
+    if settings.camera and camera is None:
         camera = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said).camera
     if camera is None:
         raise SceneError("no calibration with the recording, expected --camera with a file that has one")

@@ -1,12 +1,15 @@
 """Datasets' folders, made here with the keys, types and clocks that their authors use, become scenes."""
 
 import json
+import shutil
+import zipfile
 from pathlib import Path
 
 import cv2
 import h5py
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Writer1
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.calibration import read_calibration, read_cameras
@@ -20,9 +23,9 @@ from ebarf_ns.process import ProcessSettings, process
 from ebarf_ns.scene import read_scene
 from tests.conftest import DATA, REPOSITORY, run_command, run_ok
 from tests.events import writers
-from tests.events.test_recognise import bag1
+from tests.events.test_recognise import bag1, messages, types
 
-SECONDS = 2.0
+STEREO = [("sensor_msgs", "Image"), ("std_msgs", "Header"), ("builtin_interfaces", "Time")]
 EVENTS: list[writers.Event] = [(t, t // 1000 % 64, t // 3000 % 48, t // 7000 % 2) for t in range(0, 2_000_000, 1000)]
 POSES = [(t, 0.1 * t / 1e6, np.sin(t / 1e6), 0.0) for t in range(0, 2_100_000, 8333)]
 TURNS = [Rotation.from_rotvec([0.1 * t / 1e6, 0.2, 0.05 * t / 1e6]) for t, *_ in POSES]
@@ -211,9 +214,52 @@ def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
     assert (back * TURNS[0].inv()).magnitude() < 1e-6
 
 
+def test_flags_are_of_the_trajectory_and_leave_the_reference_as_it_says_itself(tmp_path: Path):
+    source = tumvie(tmp_path / "source")
+    wxyz = [line.split() for line in poses("s").splitlines()]
+    lines = "".join(f"{t} {x} {y} {z} {qw} {qx} {qy} {qz}\n" for t, x, y, z, qx, qy, qz, qw in wxyz)
+    (tmp_path / "odometry.txt").write_text(lines)
+    (tmp_path / "reference.txt").write_text(poses("s"))
+    settings = ProcessSettings(
+        trajectory=tmp_path / "odometry.txt",
+        trajectory_format=TrajectoryFormat(quaternion="wxyz"),
+        groundtruth=tmp_path / "reference.txt",
+    )
+    process("tumvie", source, tmp_path / "scene", settings)
+    for name in ("trajectory.txt", "groundtruth.txt"):
+        back = Rotation.from_quat(read_tum(tmp_path / "scene" / name).poses.quat_wxyz[0, [1, 2, 3, 0]].numpy())
+        assert (back * TURNS[0].inv()).magnitude() < 1e-6
+
+
+def test_the_right_camera_of_tum_vie_with_a_calibration_from_elsewhere_and_no_frames(tmp_path: Path):
+    source = tumvie(tmp_path / "source")
+    for name in ("camera-calibrationA.json", "mocap-imu-calibrationA.json"):
+        (source / name).rename(tmp_path / name)
+    (source / "mocap-desk2-events_left.h5").rename(source / "mocap-desk2-events_right.h5")
+    (source / "vi_gt_data" / "image_timestamps_right.txt").write_text("1\n2\n")  # and no pictures
+    settings = ProcessSettings(camera=tmp_path / "camera-calibrationA.json", part="right", frames=False)
+    process("tumvie", source, tmp_path / "scene", settings)
+    scene = read_scene(tmp_path / "scene")
+    assert scene.camera.width == 64 and scene.groundtruth and not scene.frames
+    with pytest.raises(SceneError, match="part 'middle', expected one of left, right"):
+        process("tumvie", source, tmp_path / "other", ProcessSettings(part="middle"))
+
+
+def test_a_calibration_that_is_given_goes_before_the_folders_own(tmp_path: Path):
+    source = robust(tmp_path / "source")
+    (source / "camera_calibration.npz").unlink()
+    process("robust-e-nerf", source, tmp_path / "scene", ProcessSettings(camera=calibration(tmp_path)))
+    scene = read_scene(tmp_path / "scene")
+    assert scene.camera.fx == 60 and scene.contrast_threshold is None
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
+        (ProcessSettings(contrast_threshold=(0.2, 0.0)), "--contrast-threshold OFF is 0.0, expected a finite number"),
+        (ProcessSettings(contrast_threshold=(float("nan"), 0.2)), "--contrast-threshold ON is nan"),
+        (ProcessSettings(bounds=((1, 1, 1), (0, 2, 2))), "--bounds is .* expected a first corner below the second"),
+        (ProcessSettings(farthest=-1.0), "--farthest is -1.0"),
         (ProcessSettings(), "expected --camera"),
         (ProcessSettings(camera=Path("gone.json")), "gone.json"),
         (ProcessSettings(events=Intake(start_us=10**9)), "expected --camera"),
@@ -239,12 +285,61 @@ def test_a_trajectory_on_another_clock_is_an_error(tmp_path: Path):
 
 
 def test_a_zip_is_as_good_as_its_folder(tmp_path: Path):
-    import shutil
-
     esim(tmp_path / "source")
     shutil.make_archive(str(tmp_path / "source"), "zip", tmp_path, "source")
+    with zipfile.ZipFile(tmp_path / "source.zip", "a") as archive:
+        archive.writestr("__MACOSX/source/._events", b"as macOS adds it")
     said = process("esim", tmp_path / "source.zip", tmp_path / "scene", ProcessSettings(camera=calibration(tmp_path)))
     assert any("2,000 kept" in sentence for sentence in said)
+
+
+def test_what_goes_wrong_after_unpacking_is_not_the_zips_fault(tmp_path: Path):
+    esim(tmp_path / "source")
+    shutil.make_archive(str(tmp_path / "source"), "zip", tmp_path, "source")
+    (tmp_path / "file").write_text("where a folder should be")
+    settings = ProcessSettings(camera=calibration(tmp_path))
+    with pytest.raises(OSError, match="file"):
+        process("esim", tmp_path / "source.zip", tmp_path / "file" / "scene", settings)
+
+
+def test_frames_of_a_bag_are_those_beside_its_events(tmp_path: Path):
+    path = stereo_bag(tmp_path / "stereo.bag")
+    (tmp_path / "odometry.txt").write_text(poses("s"))
+    (tmp_path / "camera.json").write_text(calibration(tmp_path).read_text())
+    for side, grey in (("left", 10), ("right", 200)):
+        settings = ProcessSettings(
+            camera=tmp_path / "camera.json", trajectory=tmp_path / "odometry.txt", part=f"/davis/{side}/events"
+        )
+        process("bag", path, tmp_path / side, settings)
+        pictures = [cv2.imread(str(frame.path), -1) for frame in read_scene(tmp_path / side).frames]
+        assert len(pictures) == 2 and all((one == grey).all() for one in pictures if one is not None)
+
+
+def stereo_bag(path: Path) -> Path:
+    """Two event cameras, with colour and grey pictures each."""
+    store = types(1)
+    image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in STEREO)
+    with Writer1(path) as bag:
+        for side, grey in (("left", 10), ("right", 200)):
+            events = bag.add_connection(f"/davis/{side}/events", "dvs_msgs/msg/EventArray", typestore=store)
+            for k, message in enumerate(messages(store, EVENTS, (64, 48))):
+                bag.write(events, 10**9 + k, store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
+            for name, encoding, channels in (("image_color", "bgr8", 3), ("image_raw", "mono8", 1)):
+                topic = bag.add_connection(f"/davis/{side}/{name}", "sensor_msgs/msg/Image", typestore=store)
+                for second in (0, 1):
+                    pixels = np.full(64 * 48 * channels, grey, np.uint8)
+                    head = header(0, time(second, 500_000_000), side)
+                    message = image(head, 48, 64, encoding, 0, 64 * channels, pixels)
+                    content = store.serialize_ros1(message, "sensor_msgs/msg/Image")
+                    bag.write(topic, 10**9 + second, content)
+    return path
+
+
+def test_an_equidistant_lens_without_coefficients_is_no_pinhole(tmp_path: Path):
+    text = CALIBRATIONS["kalibr.yaml"][0].replace("[0.1, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0]")
+    (tmp_path / "kalibr.yaml").write_text(text)
+    camera = read_calibration(tmp_path / "kalibr.yaml").camera
+    assert camera.model == "equidistant" and camera.distortion == (0, 0, 0, 0)
 
 
 CALIBRATIONS = {
@@ -290,7 +385,7 @@ def test_calibrations_within_a_recording_of_m3ed(tmp_path: Path):
     assert set(found) == {"prophesee/left", "ovc/left"} and found["ovc/left"].camera.model == "radtan"
     pose = found["ovc/left"].rig_from_camera
     assert pose is not None and pose[0, 3] == 0.1
-    with pytest.raises(SceneError, match="expected one of ovc/left, prophesee/left"):
+    with pytest.raises(SceneError, match="expected --camera-name with one of ovc/left, prophesee/left"):
         read_calibration(tmp_path / "data.h5")
     (tmp_path / "none.h5").write_bytes(b"nothing")
     with pytest.raises(SceneError, match="cannot be read"):

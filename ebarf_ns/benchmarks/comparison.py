@@ -9,6 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ebarf_ns.benchmarks.engine import machine
@@ -22,6 +23,8 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.scene import Scene, read_scene, write_scene
 from ebarf_ns.simulation.simulate import simulate
 from ebarf_ns.simulation.trajectory_errors import NO_ERRORS, perturb
+
+_ANOTHER_WORLD = 0.1
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,7 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
     made_of = _contents(scene), errors
     if errors is None:
         return source, made_of
+    _check_bounds_are_of_reference(scene)
     made = folder / "scenes" / _named(f"{job.scene}-{job.seed}-{job.trajectory}", made_of, job.seed)
     if not (made / "scene.json").is_file():
         with whole_folder(made) as temporary:
@@ -146,6 +150,20 @@ def _true_keyframes(scene: Scene) -> Trajectory:
     reference, t_us = read_tum(scene.groundtruth), read_tum(scene.trajectory).t_us
     t_us = t_us[within_span(t_us, reference.t_us)]
     return Trajectory(t_us, interpolate(reference.t_us, reference.poses, t_us))
+
+
+def _check_bounds_are_of_reference(scene: Scene) -> None:
+    """Bounds are of the world of the scene's own trajectory; others, made of the reference, must be in the same one."""
+    if scene.bounds is None:
+        return
+    true, own = _true_keyframes(scene), read_tum(scene.trajectory)
+    apart = interpolate(own.t_us, own.poses, true.t_us).position - true.poses.position
+    off, size = float(apart.norm(dim=-1).median()), float(np.diff(scene.bounds, axis=0).max())
+    if off > _ANOTHER_WORLD * size:
+        raise BenchmarkError(
+            f"{scene.folder}: bounds are those of its trajectory, which is {off:.3g} from the groundtruth (median) in "
+            f"bounds {size:.3g} wide; expected both in one world to make trajectories of the groundtruth, or: as given"
+        )
 
 
 def _initial_errors(scene: Scene) -> dict[str, float | None]:

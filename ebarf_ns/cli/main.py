@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
-from ebarf_ns.errors import EbarfError, SceneError, one_line_errors
+from ebarf_ns.errors import EbarfError, RecordingError, SceneError, one_line_errors
 from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
 from ebarf_ns.process import Format, ProcessSettings
 from ebarf_ns.simulation.simulate import Simulation
@@ -93,8 +93,9 @@ class Inspect:
 
     def run(self) -> None:
         """Print the summary."""
+        # A folder that is neither is taken for a scene, and told what it lacks.
         if not (self.scene / "scene.json").exists() and (
-            self.scene.is_file() or (self.scene / "metadata.yaml").exists()
+            self.scene.is_file() or (self.scene / "metadata.yaml").exists() or any(self.scene.glob("*.npy"))
         ):
             summary = self._recording()
         else:
@@ -106,6 +107,8 @@ class Inspect:
         from ebarf_ns.events.recognise import open_recording
         from ebarf_ns.raw_inspection import contact_sheet, inspect_recording, print_raw_summary
 
+        if self.picture and self.picture.suffix.lower() != ".png":
+            raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
         opened = lambda: open_recording(self.scene, part=self.part)  # noqa: E731
         summary = inspect_recording(opened)
         if self.picture:
@@ -284,30 +287,32 @@ def _print_json(content: dict[str, Any]) -> None:
 def _refuse_existing(output: Path) -> None:
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise SceneError(f"{output}: exists, expected a new folder; remove it first where it is not needed")
+    # The finished folder takes the place of an empty one, which these cannot give up.
+    if output.exists() and (output.is_mount() or output.samefile(Path.cwd())):
+        raise SceneError(f"{output}: the current folder or a mounted one, expected a new folder, which may be in it")
 
 
 def _with_config(words: list[str]) -> list[str]:
     """The words of a command, those of the file that ``--config`` names before the others, which may overrule them."""
+    # "--config=FILE" is the same.
+    split = [word.split("=", 1) if word.startswith("--config=") else [word] for word in words]
+    words = [word for parts in split for word in parts]
     if words[:1] != ["process"] or "--config" not in words[:-1]:
         return words
     path = Path(words[words.index("--config") + 1])
-    source = words[words.index("--source") + 1] if "--source" in words[:-1] else ""
-    places = {"{source}": source, "{config}": str(path.parent)}
     try:
         flags = yaml.safe_load(path.read_text(encoding="utf-8"))
         format_ = [flags.pop("format")] if "format" in flags else []
-        found = [word for name, value in flags.items() for word in _flag(name, value, places)]
-    except (OSError, yaml.YAMLError, AttributeError, TypeError) as error:
+        found = [word for name, value in flags.items() for word in _flag(name, value, path.parent)]
+    except (OSError, ValueError, yaml.YAMLError, AttributeError, TypeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise SceneError(f"{path}: {reason}; expected a YAML file of flags and their values") from None
     return ["process", *format_, *found, *words[1:]]
 
 
-def _flag(name: str, value: Any, places: dict[str, str]) -> list[str]:
+def _flag(name: str, value: Any, folder: Path) -> list[str]:
     words = [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
-    for place, path in places.items():
-        words = [word.replace(place, path) for word in words]
-    return words
+    return [word.replace("{config}", str(folder)) for word in words]
 
 
 def entrypoint() -> None:

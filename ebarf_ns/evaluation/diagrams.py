@@ -14,6 +14,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
@@ -32,6 +33,7 @@ _ERRORS = {
 _POSE_ERRORS = ("ate_m", "rotation_deg")
 _AS_GOOD_AS_NOTHING = 1e-7
 _STYLES = {"method": "-", "floor": "--", "ceiling": ":"}
+_HUGE = 1e300
 _TOLERANCES = (0.1, 0.01, 0.001)
 _PSNR_TARGETS = (20.0, 22.0, 24.0, 26.0, 28.0)
 _POSITION_TARGETS_M = (0.05, 0.02, 0.01, 0.005)
@@ -160,11 +162,7 @@ def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, s
         seconds: [error_of(_last(record), name) for record in group]
         for (seconds,), group in sorted(_problems(records, "seconds").items())
     }
-    # Without interpolation, which two trainings that failed would not survive.
-    quartiles = (0.25, 0.5, 0.75)
-    low, middle, high = np.array(
-        [[np.quantile(errors, share, method="nearest") for errors in ends.values()] for share in quartiles]
-    )
+    low, middle, high = np.array([quartiles(errors) for errors in ends.values()]).T
     known = np.isfinite(middle)
     if not known.any():
         return
@@ -178,6 +176,12 @@ def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, s
     way = np.median([[error_of(one, name) for one in record["evaluations"][:count]] for record in longest], axis=0)
     at = np.median([[one["train_seconds"] for one in record["evaluations"][:count]] for record in longest], axis=0)
     axis.plot(at, way, style, color=colour, lw=1, alpha=0.35)
+
+
+def quartiles(errors: Sequence[float]) -> Float[np.ndarray, "3"]:
+    """First quartile, median and third; infinite where a failed training takes part in them."""
+    found = np.quantile(np.minimum(errors, _HUGE), (0.25, 0.5, 0.75))
+    return np.where(found > math.sqrt(_HUGE), math.inf, found)
 
 
 def _profiles(records: Sequence[Record]) -> Figure:

@@ -16,6 +16,7 @@ from ebarf_ns.scene import Frame
 _DARKEST = 1e-3
 _SMALLEST_FOR_SSIM, _SMALLEST_FOR_LPIPS = 11, 64
 _FRAMES_TOO_SMALL = f"LPIPS left out: frames are smaller than {_SMALLEST_FOR_LPIPS} pixels"
+_WEIGHTS_CAME_LATER = "AlexNet's weights came after the evaluation: ns-eval has it now"
 
 
 def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
@@ -27,9 +28,15 @@ def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
             f"{frame.camera.width}x{frame.camera.height}"
         )
     if frame.intensity == "log":
-        return np.exp(pixels)
-    if frame.intensity == "srgb":
-        return np.where(pixels <= 0.04045, pixels / 12.92, ((np.maximum(pixels, 0.04045) + 0.055) / 1.055) ** 2.4)
+        with np.errstate(over="ignore"):
+            pixels = np.exp(pixels)
+    elif frame.intensity == "srgb":
+        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((np.maximum(pixels, 0.04045) + 0.055) / 1.055) ** 2.4)
+    if not np.isfinite(pixels).all():
+        raise EvaluationError(
+            f"{frame.path}: {np.count_nonzero(~np.isfinite(pixels))} pixels are not finite as {frame.intensity} "
+            "intensity, expected numbers"
+        )
     return pixels
 
 
@@ -124,7 +131,7 @@ def lpips_note(evaluation: dict[str, Any]) -> str | None:
     """Why an evaluation on record has no LPIPS, in a sentence; None where it has, or has no frames at all."""
     if "psnr" not in evaluation or evaluation.get("lpips") is not None:
         return None
-    return lpips_missing() or _FRAMES_TOO_SMALL
+    return lpips_missing() or f"{_FRAMES_TOO_SMALL}, or {_WEIGHTS_CAME_LATER}"
 
 
 def lpips_missing(reference: Sequence[Float[np.ndarray, "height width"]] = ()) -> str | None:

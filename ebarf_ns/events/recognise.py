@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.readers.text import TimeUnit, read_text
-from ebarf_ns.events.source import Source
+from ebarf_ns.events.readers.text import read_text
+from ebarf_ns.events.source import Source, TimeUnit
 
 RecordingFormat = Literal["hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "text"]
 _MAGIC: dict[bytes, RecordingFormat] = {
     b"\x89HDF\r\n\x1a\n": "hdf5", b"#!AER-DAT4.0": "aedat4", b"#ROSBAG V2.0": "bag", b"SQLite format 3": "bag",
-    b"\x89MCAP0\r\n": "bag", b"PK\x03\x04": "npz",
+    b"\x89MCAP0\r\n": "bag", b"PK\x03\x04": "npz", b"\x93NUMPY": "npy",
 }  # fmt: skip
 _BEGINNING = 4096
 
@@ -32,7 +32,7 @@ def open_recording(
     if found == "hdf5":
         from ebarf_ns.events.readers.hdf5 import read_hdf5
 
-        return read_hdf5(path, part)
+        return read_hdf5(path, part, time_unit)
     if found == "aedat4":
         from ebarf_ns.events.readers.aedat4 import read_aedat4
 
@@ -46,9 +46,9 @@ def open_recording(
 
         return read_raw(path) if found == "raw" else read_dat(path)
     if found in ("npz", "npy"):
-        from ebarf_ns.events.readers.arrays import read_npy_folder, read_npz
+        from ebarf_ns.events.readers.arrays import read_npy, read_npz
 
-        return read_npz(path, time_unit) if found == "npz" else read_npy_folder(path)
+        return read_npz(path, time_unit) if found == "npz" else read_npy(path)
     return read_text(path, time_unit)
 
 

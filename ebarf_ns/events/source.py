@@ -6,12 +6,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxtyping import Int64, Shaped
+    from jaxtyping import Bool, Int64, Num, Shaped
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+DECIMALS: dict[TimeUnit, int] = {"s": 6, "ms": 3, "us": 0, "ns": -3}
+"""By which power of ten a time becomes microseconds."""
+_LATEST_US = 1e18
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,22 @@ class Source:
     pieces: Iterator[Piece]
     dropped: Counter[str] = field(default_factory=Counter)
     """Events that the file hints at but does not hold in full, by reason; counted while reading."""
+
+
+def fits(t: Num[np.ndarray, "events"], unit: TimeUnit) -> Bool[np.ndarray, "events"]:
+    """Whether times of that unit can be microseconds in 64 bits; not where they are not finite."""
+    return np.abs(t.astype(np.float64)) * 10.0 ** DECIMALS[unit] <= _LATEST_US
+
+
+def microseconds(t: Num[np.ndarray, "events"], unit: TimeUnit) -> Int64[np.ndarray, "events"]:
+    """Times in a unit, rounded to the nearest; exact for integers."""
+    decimals = DECIMALS[unit]
+    if t.dtype.kind == "f":
+        return np.rint(t.astype(np.float64) * 10.0**decimals).astype(np.int64)
+    t = t.astype(np.int64, copy=False)
+    if decimals == 0:
+        return t
+    return t * 10**decimals if decimals > 0 else (t + 500) // 1000
 
 
 def numbered(first: int, word: str = "event") -> Callable[[int], str]:

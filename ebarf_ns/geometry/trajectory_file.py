@@ -1,6 +1,6 @@
 """Trajectories on disk: TUM text, ``timestamp[s] tx ty tz qx qy qz qw``, one pose a line, ``#`` starts a comment."""
 
-from decimal import Decimal, InvalidOperation, Overflow
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import torch
@@ -10,7 +10,7 @@ from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes
 
 _COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-_LARGEST = Decimal("1e30")
+_DIGITS = 30
 # Quaternions are written with 6 digits or more; further off unit length is a different mistake than rounding.
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -51,9 +51,9 @@ def _parse_pose(place: str, fields: list[str]) -> tuple[int, list[float]]:
     for name, text in zip(_COLUMNS, fields, strict=True):
         try:
             value = Decimal(text)
-        except (InvalidOperation, Overflow):
+        except InvalidOperation:
             raise TrajectoryError(f"{place}: {name} is {text!r}, expected a number") from None
-        if not value.is_finite() or abs(value) > _LARGEST:
+        if not value.is_finite() or value.adjusted() >= _DIGITS:
             raise TrajectoryError(f"{place}: {name} is {text}, expected a finite number")
         values.append(value)
     t_us = int((values[0] * 1_000_000).to_integral_value())

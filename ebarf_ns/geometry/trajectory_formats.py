@@ -6,11 +6,12 @@ of a quaternion's columns cannot: every order is a rotation as smooth as the rig
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Literal, get_args
 
 import h5py
 import numpy as np
@@ -19,6 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.files import opened_npz
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -34,7 +36,9 @@ _AXES: dict[Axes, np.ndarray] = {
     "llff": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
 }
 _SPACINGS_S = (1e-4, 10.0)
+_SINCE_1970_US, _SINCE_1970_NS = 1e14, 1e17
 _UNIT_LENGTH = 1e-3
+_DIGITS = 30
 
 
 @dataclass(frozen=True)
@@ -123,14 +127,14 @@ def _recognised_unit(path: Path, times: list[Decimal]) -> TimeUnit:
     fitting: list[TimeUnit] = [
         unit for unit in units if _SPACINGS_S[0] <= spacing * float(_US[unit]) * 1e-6 <= _SPACINGS_S[1]
     ]
-    if fitting == ["us", "ns"]:
+    if fitting == ["us", "ns"] and float(max(times)) > _SINCE_1970_US:
         # A tenth of a second or more in microseconds, or as little as a tenth of a millisecond in nanoseconds: since
         # 1970, nanoseconds have grown by 18 digits, and microseconds by 15.
-        fitting = ["ns"] if float(max(times)) > 1e17 else ["us"]
+        fitting = ["ns"] if float(max(times)) > _SINCE_1970_NS else ["us"]
     if len(fitting) != 1:
         raise TrajectoryError(
-            f"{path}: poses are {spacing:g} apart (median), which is a plausible spacing in no unit; expected seconds, "
-            "microseconds or nanoseconds, or --pose-time-unit"
+            f"{path}: poses are {spacing:g} apart (median), which is a plausible spacing in "
+            f"{' and in '.join(fitting) or 'no unit'}; expected --pose-time-unit"
         )
     return fitting[0]
 
@@ -175,18 +179,17 @@ def _read(path: Path, known: TrajectoryFormat) -> _Raw:
 def _text(path: Path, lines: list[str], known: TrajectoryFormat) -> _Raw:
     """TUM's eight columns, KITTI's twelve, or a 4x4 matrix, with or without a time before it."""
     rows: list[list[Decimal]] = []
-    names, pointed = None, False
+    header, named, pointed = "", False, False
     for number, line in enumerate(lines, start=1):
         fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
-        if "#" in line and not rows and not fields:
-            names = line
         if not fields:
+            header += "" if rows else line + "\n"
             continue
         values = [_number(field) for field in fields]
         if None in values:
-            if rows or names:
+            if rows or named:
                 raise TrajectoryError(f"{path}:{number}: {line.strip()!r:.60} is no pose, expected numbers")
-            names = line
+            header, named = header + line + "\n", True
             continue
         if rows and len(values) != len(rows[0]):
             raise TrajectoryError(f"{path}:{number}: {len(values)} columns, expected {len(rows[0])} as before")
@@ -196,7 +199,7 @@ def _text(path: Path, lines: list[str], known: TrajectoryFormat) -> _Raw:
         raise TrajectoryError(f"{path}: holds no poses")
     count = len(rows[0])
     if count == 8:
-        return _tum(path, rows, names, pointed)
+        return _tum(path, rows, header.lower(), pointed)
     if count in (12, 13, 16, 17):
         timed = count in (13, 17)
         numbers = np.array([row[timed:] for row in rows], float).reshape(len(rows), -1, 4)
@@ -210,21 +213,25 @@ def _number(text: str) -> Decimal | None:
         value = Decimal(text)
     except InvalidOperation:
         return None
-    return value if value.is_finite() and abs(value) < Decimal("1e30") else None
+    return value if value.is_finite() and value.adjusted() < _DIGITS else None
 
 
-def _tum(path: Path, rows: list[list[Decimal]], names: str | None, pointed: bool) -> _Raw:
+def _tum(path: Path, rows: list[list[Decimal]], header: str, pointed: bool) -> _Raw:
     numbers = np.array([row[1:] for row in rows], float)
     length = np.linalg.norm(numbers[:, 3:], axis=1)
     if (wrong := np.abs(length - 1) > _UNIT_LENGTH).any():
         k = int(wrong.argmax())
         raise TrajectoryError(f"{path}: the quaternion of pose {k} has length {length[k]:.6g}, expected 1")
     times = [row[0] for row in rows]
-    unit: TimeUnit | None = next((one for one in ("ns", "us") if names and f"[{one}]" in names), None)
-    unit = "s" if unit is None and names and ("[s]" in names or "[secs]" in names) else unit
+    unit: TimeUnit | None = next((one for one in ("ns", "us") if f"[{one}]" in header), None)
+    unit = "s" if unit is None and ("[s]" in header or "[secs]" in header) else unit
+    # "qx qy qz qw", or EuRoC's "q_RS_w [], q_RS_x [], ...".
+    order = "".join(re.findall(r"\bq\w*?([wxyz])\b", header))
+    said: Quaternion | None = next((one for one in get_args(Quaternion) if one == order), None)
     # Microseconds written as floats, without names, are the mark of one family of odometry.
-    doubtful = not names and pointed and (unit or _recognised_unit(path, times)) == "us"
-    return _Raw("TUM text", times, numbers[:, :3], numbers[:, 3:], None if doubtful else "xyzw", time_unit=unit)
+    doubtful = pointed and (unit or _recognised_unit(path, times)) == "us"
+    quaternion = said or (None if doubtful else "xyzw")
+    return _Raw("TUM text", times, numbers[:, :3], numbers[:, 3:], quaternion, time_unit=unit)
 
 
 def _rotations(path: Path, matrices: Float[np.ndarray, "poses 3 3"]) -> Float[np.ndarray, "poses 3 3"]:
@@ -237,7 +244,7 @@ def _rotations(path: Path, matrices: Float[np.ndarray, "poses 3 3"]) -> Float[np
 
 
 def _robust_e_nerf(path: Path) -> _Raw:
-    with np.load(path) as file:
+    with opened_npz(path) as file:
         times = [Decimal(int(t)) for t in file["T_wc_timestamp"]]
         position, rotation = file["T_wc_position"].astype(float), file["T_wc_orientation"].astype(float)
     return _Raw("Robust e-NeRF npz", times, position, rotation, "xyzw", time_unit="ns")
@@ -319,13 +326,18 @@ def _times(path: Path, count: int, names: list[str] | None, known: TrajectoryFor
     if known.pose_times is None:
         raise TrajectoryError(f"{path}: has no times, expected --pose-times with a line for each of its {count} poses")
     times: dict[str, Decimal] = {}
-    for number, line in enumerate(known.pose_times.read_text(encoding="utf-8").splitlines(), start=1):
+    try:
+        lines = known.pose_times.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TrajectoryError(f"{known.pose_times}: cannot be read ({reason}), expected a time a line") from None
+    for number, line in enumerate(lines, start=1):
         fields = line.split("#")[0].replace(",", " ").split()
         if not fields:
             continue
-        # "time", "name time" or "time name".
+        # "time", "name time", where the name may be a number, or "time name".
         values = [_number(field) for field in fields[:2]]
-        place = 0 if values[0] is not None else len(values) - 1
+        place = len(values) - 1 if values[-1] is not None else 0
         time = values[place]
         if time is None:
             if number == 1:

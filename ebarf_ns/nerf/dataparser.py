@@ -24,6 +24,7 @@ from ebarf_ns.scene import Frame, Scene, box_of_bounds, check_bounds, read_scene
 # Without bounds, the trajectory fills this share of the part of space that is not contracted.
 _TRAJECTORY_SHARE = 0.25
 _STAND_IN_VIEWS = 8
+_ASIDE_PX = 1e-3
 
 
 class Normalization(NamedTuple):
@@ -159,11 +160,13 @@ def _nerfstudio_cameras(
     def column(name: str) -> Tensor:
         return torch.tensor([[getattr(camera, name)] for camera in cameras])
 
+    # At the very centre of a fisheye, nerfstudio divides 0 by 0.
+    aside = torch.tensor([[_ASIDE_PX if camera.model == "equidistant" else 0.0] for camera in cameras])
     return Cameras(
         camera_to_worlds=opengl_from_opencv(camera_to_world),
         fx=column("fx"),
         fy=column("fy"),
-        cx=column("cx") + 0.5,  # nerfstudio's pixel centres are at half integers
+        cx=column("cx") + 0.5 + aside,  # nerfstudio's pixel centres are at half integers
         cy=column("cy") + 0.5,
         width=column("width"),
         height=column("height"),

@@ -97,7 +97,8 @@ class EbarfPipeline(VanillaPipeline):
         trajectory_errors, scale = self._trajectory_errors()
         results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors}
         self.train()
-        return results
+        # JSON knows no NaN.
+        return {name: None if value != value else value for name, value in results.items()}
 
     def _heldout(self) -> dict[str, float | None]:
         """How well held-out events are predicted, and the contrast thresholds by which they would be best."""
@@ -131,16 +132,19 @@ class EbarfPipeline(VanillaPipeline):
             results |= self._compare(within, cameras, scale_to_reference, renders)
         if outside:
             results |= {"frames_outside_span": float(len(outside))}
-            cameras = self._cameras_at_reference(outside)
-            if cameras is not None:
-                errors = self._compare(outside, cameras, scale_to_reference)
+            if placed := self._placed_by_reference(outside):
+                errors = self._compare(*placed, scale_to_reference)
                 results |= {f"{name}_outside_span": value for name, value in errors.items()}
         return results
 
-    def _cameras_at_reference(self, frames: list[Frame]) -> Cameras | None:
+    def _placed_by_reference(self, frames: list[Frame]) -> tuple[list[Frame], Cameras] | None:
+        """Those within the reference's span, and their cameras."""
         if self.scene.groundtruth is None:
             return None
         reference = read_tum(self.scene.groundtruth)
+        frames = [frame for frame in frames if reference.t_us[0] <= frame.t_us <= reference.t_us[-1]]
+        if not frames:
+            return None
         t_us = torch.tensor([frame.t_us for frame in frames])
         try:
             poses = reference_in_estimates_world(self.trajectory(), reference, t_us)
@@ -150,7 +154,7 @@ class EbarfPipeline(VanillaPipeline):
         cameras = frame_cameras(frames, placed, self._mount_scale)
         # Without their times, cameras are not moved along with the refined trajectory.
         cameras.metadata = {}
-        return cameras
+        return frames, cameras
 
     def _compare(
         self, frames: list[Frame], cameras: Cameras, scale_to_reference: float | None, renders: Path | None = None

@@ -56,6 +56,7 @@ _LEAST = {
     "pipeline.model.most_hidden": 1e-6,
     "pipeline.model.outliers_from": 1e-3,
     "pipeline.model.render_variance": 0,
+    "pipeline.model.ratio_prior": 0,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
     "pipeline.model.camera_optimizer.keyframe_stride": 1,
@@ -164,6 +165,7 @@ class EbarfTrainer(Trainer):
         self.train_seconds = 0.0
         self.event_pairs = 0
         self.steps_done = 0
+        self._metric_lines: list[str] = []
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
             for flag in ("max_num_iterations", "max_train_seconds"):
@@ -288,7 +290,7 @@ class EbarfTrainer(Trainer):
             "step": self.steps_done,
             "train_seconds": round(self.train_seconds, 3),
             "event_pairs": self.event_pairs,
-            "loss": loss,
+            "loss": loss if loss == loss else None,
             **results,
             "skipped_steps": self.optimizers.skipped,
             "peak_memory_mib": round(peak_memory_mib(self.device), 1),
@@ -309,15 +311,18 @@ class EbarfTrainer(Trainer):
         lines = path.read_text(encoding="utf-8").splitlines() if goes_on else [json.dumps(self._header())]
         header, *records = lines
         # What was evaluated after the checkpoint will be again.
-        records = [record for record in records if json.loads(record)["step"] <= self._start_step]
-        with whole_file(path) as temporary:
-            temporary.write_text("\n".join([header, *records]) + "\n", encoding="utf-8")
+        self._metric_lines = [header, *(record for record in records if json.loads(record)["step"] <= self._start_step)]
+        self._write_metrics()
 
     @check_main_thread
     def _record_metrics(self, record: dict[str, Any]) -> None:
-        finite = {key: None if value != value else value for key, value in record.items()}
-        with (self.base_dir / "metrics.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(finite) + "\n")
+        self._metric_lines.append(json.dumps(record))
+        self._write_metrics()
+
+    def _write_metrics(self) -> None:
+        # All of it each time: what ends a run in the middle of a line would leave a file that nothing reads.
+        with whole_file(self.base_dir / "metrics.jsonl") as temporary:
+            temporary.write_text("\n".join(self._metric_lines) + "\n", encoding="utf-8")
 
     def _header(self) -> dict[str, Any]:
         device = torch.cuda.get_device_name() if self.device.startswith("cuda") else platform.processor() or "cpu"
@@ -378,9 +383,9 @@ class EbarfTrainer(Trainer):
         path = self._loaded_path()
         try:
             super()._load_checkpoint()
-        except (RuntimeError, KeyError, ValueError, EOFError, UnpicklingError) as error:
+        except (RuntimeError, LookupError, TypeError, ValueError, EOFError, UnpicklingError) as error:
             # Of what is no pickle, torch says how to be less careful with it.
-            unreadable = isinstance(error, (UnpicklingError, EOFError)) or not str(error)
+            unreadable = isinstance(error, (UnpicklingError, EOFError, TypeError, IndexError)) or not str(error)
             said = "it is no checkpoint" if unreadable else str(error).splitlines()[-1].strip()
             expected = "expected a run's checkpoint, with the flags it was made by"
             raise TrainingError(f"{path}: cannot go on from it ({said}), {expected}") from None

@@ -58,9 +58,9 @@ def threshold_loss(
     that comes ``render_variance``, in variances of one event: what renders are wrong by however many events there are.
     So long pairs, which tell brightness at large, weigh little less than short ones. Errors beyond ``outliers_from``
     standard deviations count by their size, no longer by its square (Huber 1964): what a render gets wrong at
-    silhouettes must not bend the trajectory.
+    silhouettes must not bend the trajectory. Pairs without any event weigh no more than those of one.
     """
-    deviations = ((render_variance + variance) / (render_variance + 1)).sqrt()
+    deviations = ((render_variance + variance).clamp_min(1) / (render_variance + 1)).sqrt()
     error = (change - reported) / (threshold * deviations)
     if outliers_from is None:
         cost = error * error

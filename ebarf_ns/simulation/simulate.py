@@ -1,7 +1,7 @@
 """Surroundings + motion + sensor: a scene folder like any other, with the truth beside it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +20,7 @@ from ebarf_ns.simulation.motion import Faster, sample_trajectory
 from ebarf_ns.simulation.record import record
 from ebarf_ns.simulation.room import Room
 from ebarf_ns.simulation.sensor import SensorModel
-from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
+from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, check_errors, perturb
 from ebarf_ns.simulation.view import View
 
 _LARGEST = 1e5
@@ -123,6 +123,7 @@ def _check(settings: Simulation) -> int:
     if len(settings.distortion) not in COEFFICIENTS[settings.lens]:
         counts = " or ".join(map(str, COEFFICIENTS[settings.lens]))
         raise SimulationError(f"distortion has {len(settings.distortion)} values, expected {counts} of {settings.lens}")
+    check_errors(settings.errors)
     end_us = round(settings.duration_s * 1e6)
     if end_us * settings.keyframe_rate_hz < 1e6:
         raise SimulationError(
@@ -138,8 +139,7 @@ def _view(place: Place, settings: Simulation, rays_per_pixel: int | None = None)
     )  # fmt: skip
     room = place.room
     if settings.mesh:
-        empty = Room(boxes=(), balls=(), seed=settings.seed)
-        room = RoomWithMesh(empty, settings.mesh, _MESH_SIZE_M, place.middle)
+        room = RoomWithMesh(replace(room, boxes=(), balls=()), settings.mesh, _MESH_SIZE_M, place.middle)
     motion = place.motion if settings.speed == 1 else Faster(place.motion, settings.speed)
     return View(room, motion, camera, rays_per_pixel or settings.rays_per_pixel)
 

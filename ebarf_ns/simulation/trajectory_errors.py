@@ -40,11 +40,8 @@ NO_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
 """The true trajectory."""
 
 
-def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Trajectory:
-    """A trajectory with errors; rotations and shifts are applied in each keyframe's own frame.
-
-    Raises :class:`SimulationError` for errors that leave no trajectory.
-    """
+def check_errors(errors: TrajectoryErrors) -> None:
+    """Raise :class:`SimulationError` for errors that leave no trajectory."""
     for name, value in vars(errors).items():
         if not math.isfinite(value) or (value < 0 and name != "clock_offset_us"):
             raise SimulationError(f"{name} is {value}, expected 0 or more")
@@ -52,6 +49,14 @@ def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Traj
         raise SimulationError(f"dropped is {errors.dropped}, expected a share from 0 to below 1")
     if not errors.scale > 0:
         raise SimulationError(f"scale is {errors.scale}, expected a value above 0")
+
+
+def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Trajectory:
+    """A trajectory with errors; rotations and shifts are applied in each keyframe's own frame.
+
+    Raises :class:`SimulationError` for errors that leave no trajectory.
+    """
+    check_errors(errors)
     count = len(trajectory.t_us)
     if count < 2 or seed < 0:
         raise SimulationError(f"{count} keyframes and seed {seed}, expected 2 keyframes or more, and a seed from 0 on")

@@ -130,6 +130,49 @@ def test_a_folder_with_something_in_it_is_never_replaced(tmp_path: Path):
     assert finished.code == 2 and "expected a new folder" in finished.errors and (tmp_path / "thesis.tex").exists()
 
 
+def test_the_current_folder_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    finished = run_command("ebarf", "simulate", ".")
+    assert finished.code == 2 and "the current folder" in finished.errors and tmp_path.is_dir()
+
+
+def test_a_link_to_an_empty_folder_is_filled(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "scene").symlink_to(tmp_path / "disk")
+    run_ok("ebarf", "process", "ecd", ecd_folder(tmp_path / "raw"), "--output", tmp_path / "scene")
+    assert (tmp_path / "scene").is_symlink() and read_scene(tmp_path / "disk").events.is_file()
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path):
+    (tmp_path / "file").write_text("where a folder should be")
+    source = ecd_folder(tmp_path / "raw")
+    finished = run_command("ebarf", "process", "ecd", source, "--output", tmp_path / "file" / "scene")
+    assert finished.code == 2 and finished.errors.count("\n") == 1 and str(tmp_path / "file") in finished.errors
+
+
+def test_flags_from_a_file_in_either_spelling(tmp_path: Path):
+    (tmp_path / "flags.yaml").write_text("format: ecd\ncontrast-threshold: [0.2, 0.3]\n")
+    for number, words in enumerate(([f"--config={tmp_path / 'flags.yaml'}"], ["--config", tmp_path / "flags.yaml"])):
+        source, scene = ecd_folder(tmp_path / f"raw{number}"), tmp_path / f"scene{number}"
+        run_ok("ebarf", "process", *words, "--source", source, "--output", scene)
+        threshold = read_scene(scene).contrast_threshold
+        assert threshold and (threshold.on, threshold.off) == (0.2, 0.3)
+    (tmp_path / "flags.yaml").write_bytes(b"format: \xff\n")
+    finished = run_command("ebarf", "process", "--config", tmp_path / "flags.yaml", "--output", tmp_path / "other")
+    assert finished.code == 2 and "expected a YAML file" in finished.errors
+
+
+def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path: Path):
+    source = ecd_folder(tmp_path / "raw") / "events.txt"
+    finished = run_command("ebarf", "inspect", source, "--picture", tmp_path / "sheet")
+    assert finished.code == 2 and "expected the name of a .png file" in finished.errors
+
+
+def test_errors_that_leave_no_trajectory_are_said_before_anything_is_simulated(tmp_path: Path):
+    finished = run_command("ebarf", "simulate", tmp_path / "scene", "--duration-s", 1e4, "--dropped", 1, timeout_s=20)
+    assert finished.code == 2 and "dropped is 1" in finished.errors
+
+
 def test_evaluate_of_no_run_is_one_line(tmp_path: Path):
     finished = run_command("ebarf", "evaluate", tmp_path)
     assert finished.code == 2 and "expected the folder of a training run" in finished.errors

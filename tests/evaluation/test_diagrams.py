@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from ebarf_ns.evaluation.diagrams import error_of, performance_profile, seconds_to, tables
+from ebarf_ns.evaluation.diagrams import error_of, performance_profile, quartiles, seconds_to, tables
 
 
 def record(method: str, seed: int, errors_m: list[float], seconds: float = 20.0) -> dict:
@@ -18,6 +18,12 @@ def test_image_error_is_the_root_mean_square_and_unknown_errors_are_infinite():
     assert error_of({"psnr": 20.0}, "image") == pytest.approx(0.1)
     assert error_of({"psnr": None}, "image") == math.inf and error_of({}, "ate_m") == math.inf
     assert error_of({"ate_m": None, "ate_m_orientation": 0.02}, "ate_m") == 0.02
+
+
+def test_quartiles_of_three_seeds_are_between_them_and_infinite_where_a_training_failed():
+    assert quartiles([1.0, 2.0, 4.0]).tolist() == [1.5, 2.0, 3.0] and quartiles([1.0, 2.0]).tolist()[1] == 1.5
+    assert quartiles([1.0, math.inf, 2.0]).tolist() == [1.5, 2.0, math.inf]
+    assert quartiles([math.inf, math.inf, 2.0]).tolist() == [math.inf] * 3
 
 
 def test_time_to_target_is_the_first_time_and_infinite_where_never():

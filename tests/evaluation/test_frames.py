@@ -45,6 +45,15 @@ def test_intensity_says_how_to_get_to_linear(tmp_path: Path):
     assert np.allclose(read_frame(frame(tmp_path / "srgb.npy", "srgb")), picture(), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("intensity", "value"), [("linear", np.nan), ("linear", np.inf), ("log", 1e4)])
+def test_pixels_that_are_not_finite_are_counted(tmp_path: Path, intensity: str, value: float):
+    pixels = picture()
+    pixels[3, 4:6] = value
+    np.save(tmp_path / "a.npy", pixels)
+    with pytest.raises(EvaluationError, match=f"a.npy: 2 pixels are not finite as {intensity} intensity"):
+        read_frame(frame(tmp_path / "a.npy", intensity))
+
+
 def test_exr_is_read(tmp_path: Path):
     cv2.imwrite(str(tmp_path / "a.exr"), (5 * picture()).astype(np.float32))
     assert np.allclose(read_frame(frame(tmp_path / "a.exr")), 5 * picture(), rtol=1e-3)

@@ -68,6 +68,12 @@ def npy(path: Path) -> Path:
     return path
 
 
+def npy_file(path: Path) -> Path:
+    t, x, y, p = columns()
+    np.save(path, np.stack([x, y, t * 1000, 2 * p - 1], 1).astype(float))
+    return path
+
+
 def text(path: Path) -> Path:
     path.write_text("".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for t, x, y, p in EVENTS))
     return path
@@ -136,6 +142,7 @@ MADE: dict[str, Callable[[Path], Path]] = {
     "a.npz": npz,
     "raw_events.npz": robust,
     "npy": npy,
+    "a.npy": lambda path: npy_file(path),
     "a.txt": text,
     "a.bag": bag1,
     "ros2": bag2,
@@ -211,6 +218,31 @@ def test_other_files_are_no_recordings(tmp_path: Path, content: bytes):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(RecordingError, match="file"):
         list(open_recording(tmp_path / "file").pieces)
+
+
+def test_times_in_nanoseconds_where_hdf5_does_not_say_so(tmp_path: Path):
+    path = hdf5(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        del file["events/t"]
+        file["events/t"] = 1000 * columns()[0] + 499
+    back = checked(open_recording(path, time_unit="ns"), SIZE)
+    assert np.array_equal(back.t_us, writers.recording(EVENTS).t_us)
+
+
+def test_a_file_of_a_ros2_bag_is_as_good_as_its_folder_and_alone_says_what_it_lacks(tmp_path: Path):
+    folder = bag2(tmp_path / "ros2")
+    (database,) = folder.glob("*.db3")
+    assert np.array_equal(checked(open_recording(database), SIZE).t_us, writers.recording(EVENTS).t_us)
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(RecordingError, match="no metadata.yaml beside it, expected a ROS 2 bag's folder"):
+        open_recording(database)
+
+
+@pytest.mark.parametrize("known", ["npz", "npy"])
+def test_one_kind_of_array_file_taken_for_another_is_named(tmp_path: Path, known: str):
+    path = (npy_file if known == "npz" else npz)(tmp_path / ("a.npy" if known == "npz" else "a.npz"))
+    with pytest.raises(RecordingError, match=r"a.np."):
+        list(open_recording(path, known).pieces)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.bag"])

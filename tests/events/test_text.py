@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.intake import checked
 from ebarf_ns.events.readers import text
-from ebarf_ns.events.readers.text import TimeUnit, read_text
+from ebarf_ns.events.readers.text import read_text
 from ebarf_ns.events.recording import Recording
+from ebarf_ns.events.source import TimeUnit
 
 WIDTH, HEIGHT = 240, 180
 
@@ -97,6 +98,11 @@ def test_blocks_of_any_size_give_the_same(tmp_path: Path, monkeypatch: pytest.Mo
             [10**7, 10**7 + 2],
         ),
         ("5 1 2 1\n6 1 2 -1\n", "ms", [5000, 6000]),
+        ("0 1 2 1\n0.000123 1 2 0\n", None, [0, 123]),
+        ("\ufefft[\u00b5s],x,y,p\n1000.4,1,2,1\n2000,1,2,0\n", None, [1000, 2000]),
+        ("\ufeff5,1,2,1\n7,1,2,0\n", None, [5, 7]),
+        ("time (\u03bcs),x,y,p\n5,1,2,1\n7,1,2,0\n", None, [5, 7]),
+        ("time [microseconds] x y p\n5 1 2 1\n7 1 2 0\n", None, [5, 7]),
         ("time y x p extra\n0.5 2 1 1 9.9\n0.6 2 1 0 -3\n", None, [500_000, 600_000]),
     ],
 )
@@ -109,6 +115,16 @@ def test_columns_and_units_as_files_have_them(tmp_path: Path, content: str, unit
 def test_columns_that_are_missing_are_named(tmp_path: Path):
     with pytest.raises(RecordingError, match="expected t, x, y and p once each"):
         read(tmp_path, "t,x,p\n1,2,1\n", None)
+
+
+def test_a_unit_that_is_not_known_is_named_and_not_guessed(tmp_path: Path):
+    with pytest.raises(RecordingError, match="times in 'ticks', expected one of .* or --event-time-unit"):
+        read(tmp_path, "t[ticks],x,y,p\n5,1,2,1\n", None)
+
+
+def test_fractions_of_guessed_microseconds_are_an_error(tmp_path: Path):
+    with pytest.raises(RecordingError, match=r":2001: '0.5 1 2 1' is not an event, expected 't\[us\] x y p'"):
+        read(tmp_path, "0 1 2 1\n" * 2000 + "0.5 1 2 1\n", None)
 
 
 def test_binary_rubbish_is_an_error(tmp_path: Path):

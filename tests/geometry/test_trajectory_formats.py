@@ -74,6 +74,48 @@ def test_the_order_that_devo_writes_must_be_told(tmp_path: Path):
     check(read_trajectory(tmp_path / "t.txt", TrajectoryFormat(quaternion="yzwx"))[0])
 
 
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        (
+            "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+            [3, 0, 1, 2],
+        ),
+        ("# made by a program\ntimestamp,tx,ty,tz,qw,qx,qy,qz", [3, 0, 1, 2]),
+        ("# timestamp tx ty tz qx qy qz qw", [0, 1, 2, 3]),
+    ],
+)
+def test_a_header_tells_the_order_of_quaternions(tmp_path: Path, header: str, order: list[int]):
+    (tmp_path / "t.txt").write_text(
+        header + "\n" + rows([str(1000 * t) for t in T_US], np.hstack([POSITION, QUAT[:, order]]))
+    )
+    check(read_trajectory(tmp_path / "t.txt")[0])
+
+
+def test_a_comment_without_names_does_not_tell_devos_order(tmp_path: Path):
+    text = rows([f"{float(t)}" for t in T_US], np.hstack([POSITION, QUAT[:, [1, 2, 3, 0]]]))
+    (tmp_path / "t.txt").write_text("# run 3\n" + text)
+    with pytest.raises(TrajectoryError, match="expected --quaternion yzwx"):
+        read_trajectory(tmp_path / "t.txt")
+
+
+def test_a_spacing_that_fits_two_units_is_asked_for(tmp_path: Path):
+    since_start_ns = [str(10**6 * k) for k in range(COUNT)]
+    (tmp_path / "t.txt").write_text(rows(since_start_ns, np.hstack([POSITION, QUAT])))
+    with pytest.raises(TrajectoryError, match="plausible spacing in us and in ns; expected --pose-time-unit"):
+        read_trajectory(tmp_path / "t.txt")
+    check(read_trajectory(tmp_path / "t.txt", TrajectoryFormat("ns"))[0], 1000 * np.arange(COUNT))
+
+
+def test_times_by_number_and_name(tmp_path: Path):
+    (tmp_path / "kitti.txt").write_text("\n".join(" ".join(map(repr, m.ravel().tolist())) for m in matrices()))
+    (tmp_path / "times.txt").write_text("\n".join(f"{k} {t}" for k, t in enumerate(seconds(T_US))))
+    known = TrajectoryFormat(pose_times=tmp_path / "times.txt")
+    check(read_trajectory(tmp_path / "kitti.txt", known)[0])
+    with pytest.raises(TrajectoryError, match=r"gone.txt: cannot be read"):
+        read_trajectory(tmp_path / "kitti.txt", TrajectoryFormat(pose_times=tmp_path / "gone.txt"))
+
+
 def test_quaternions_first_and_world_to_camera(tmp_path: Path):
     inverse = TURN.inv()
     text = rows(seconds(T_US), np.hstack([-inverse.apply(POSITION), inverse.as_quat()[:, [3, 0, 1, 2]]]))
@@ -156,6 +198,7 @@ def test_robust_e_nerf(tmp_path: Path):
     [
         ("", "holds no poses"),
         ("1 2 3\n", "3 columns, expected 8"),
+        ("0 0 0 0 0 0 0 1\n1e9999999 0 0 0 0 0 0 1\n", ":2: "),
         ("0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n", "has length 2, expected 1"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 zero 0 0 1\n", ":2: "),
         ("0 0 0 0 0 0 0 1\n1 0 0\n", "3 columns, expected 8 as before"),

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
-from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
+from ebarf_ns.nerf.dataparser import EbarfDataParserConfig, frame_cameras
 from ebarf_ns.scene import read_scene, write_scene
 
 
@@ -34,3 +35,11 @@ def test_a_frame_camera_beside_the_event_camera_is_so_many_metres_away_whatever_
         places.append(outputs.cameras.camera_to_worlds[:, :, 3] / outputs.dataparser_scale)
     apart = (places[1] - places[0]).norm(dim=-1)
     assert torch.allclose(apart, torch.full_like(apart, 0.3 * scale), rtol=1e-4)
+
+
+def test_rays_of_a_fisheye_are_those_of_its_camera_at_the_very_centre_too(tiny_scene: Path):
+    camera = Camera("equidistant", 9, 7, 10.0, 10.0, 4.0, 3.0, (0.1, 0.0, 0.0, 0.0))
+    frame = dataclasses.replace(read_scene(tiny_scene).frames[0], camera=camera)
+    still = Trajectory(torch.tensor([0]), Poses(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])))
+    rays = frame_cameras([frame], still, 1.0).generate_rays(camera_indices=0).directions
+    assert torch.allclose(rays, camera.bearings(camera.pixel_grid()).float(), atol=1e-3)

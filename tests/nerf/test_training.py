@@ -99,6 +99,7 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
         made = config(scene, tmp_path / f"run, told {told}", steps=1500)
         # What a field cannot show is missing in the changes that tell the ratio.
         model = made.pipeline.model
+        model.ratio_prior = 0.0  # pyright: ignore[reportAttributeAccessIssue]
         model.grid_table_size_log2, model.grid_levels, model.grid_finest, model.samples = 14, 6, 128, 24  # pyright: ignore[reportAttributeAccessIssue]
         ready = trainer(made)
         ready.train()
@@ -115,6 +116,9 @@ def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     lines = (scene / "trajectory.txt").read_text().splitlines()
     (scene / "trajectory.txt").write_text("\n".join(lines[:8]))
+    frames = json.loads((scene / "frames.json").read_text())
+    # Of one more, not even the reference tells.
+    (scene / "frames.json").write_text(json.dumps([*frames, {**frames[-1], "t_us": 10**7}]))
     ready = trainer(config(scene, tmp_path, steps=40))
     ready.train()
     results = ready.pipeline.evaluate()
@@ -288,7 +292,7 @@ def test_a_checkpoint_that_is_none_is_named(
     assert stopped.value.code == 2 and "step-000000007.ckpt: is no file, expected" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("what", ["text", "of other flags"])
+@pytest.mark.parametrize("what", ["text", "a list", "of other flags"])
 def test_what_cannot_be_gone_on_from_ends_in_one_line(
     tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
 ):
@@ -296,6 +300,8 @@ def test_what_cannot_be_gone_on_from_ends_in_one_line(
     path = tmp_path / "step-000000007.ckpt"
     if what == "text":
         path.write_text("no checkpoint")
+    elif what == "a list":
+        torch.save([1, 2], path)
     else:
         first = trainer(made)
         first.train()

@@ -50,6 +50,13 @@ def test_what_renders_are_wrong_by_makes_long_pairs_weigh_little_less_than_short
     assert float(of_four) == pytest.approx(6 / 9)
 
 
+def test_pairs_without_any_event_have_finite_losses_even_where_renders_are_taken_to_be_right():
+    change = torch.tensor([0.0, 0.5], requires_grad=True)
+    loss = threshold_loss(change, torch.zeros(2), torch.zeros(2), 0.25, 0.3, render_variance=0.0)
+    (gradient,) = torch.autograd.grad(loss, change)
+    assert gradient.isfinite().all() and gradient[0] == 0 < gradient[1]
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_normalized_loss_does_not_know_the_threshold(factor: float):
     change, reported, _ = batch(64)

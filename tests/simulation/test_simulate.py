@@ -19,6 +19,7 @@ from ebarf_ns.simulation.room import Room
 from ebarf_ns.simulation.sensor import SensorModel
 from ebarf_ns.simulation.simulate import Simulation, simulate
 from ebarf_ns.simulation.view import View
+from tests.simulation.test_mesh import COLOURED_SQUARE
 
 
 def test_scene_is_whole_and_its_pictures_show_something(tiny_scene: Path):
@@ -109,6 +110,14 @@ def test_a_window_is_a_thousand_times_brighter_than_the_room():
     )
     radiance, _ = view.images(np.linspace(0, 2e6, 5))
     assert radiance.max() > 100 * np.median(radiance) and radiance.min() < 1
+
+
+def test_a_mesh_takes_the_place_of_boxes_and_balls_and_of_nothing_else(tmp_path: Path):
+    (tmp_path / "square.ply").write_text(COLOURED_SQUARE)
+    settings = replace(SMALL, scene="hdr-window", mesh=tmp_path / "square.ply", duration_s=2.0, frames=5)
+    scene = simulate(settings, tmp_path / "scene")
+    # Daylight is beyond what a frame can hold.
+    assert max(float(read_frame(frame).max()) for frame in scene.frames) == 1
 
 
 def test_speed_plays_the_same_motion_faster(tmp_path: Path):

@@ -85,6 +85,26 @@ def test_case_25_a_full_disk_leaves_the_older_checkpoint(
     assert newest_checkpoint(ready.checkpoint_dir)["step"] == 4 and not list(ready.base_dir.glob("*.ckpt"))
 
 
+def test_case_25_a_full_disk_leaves_the_evaluations_before_it_and_is_one_line(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    ready = trainer(config(small_scene, tmp_path))
+    write = Path.write_text
+
+    def fill(path: Path, text: str, **options: str) -> None:
+        full = "metrics" in path.name and len(text.splitlines()) > 2
+        write(path, text[: len(text) // 2] if full else text, **options)
+        if full:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", fill)
+    with pytest.raises(SystemExit) as stopped:
+        ready.train()
+    assert stopped.value.code == 2 and capsys.readouterr().err == "error: No space left on device\n"
+    header, first = [json.loads(line) for line in (ready.base_dir / "metrics.jsonl").read_text().splitlines()]
+    assert header["method"] == "ebarf" and first["step"] == ready.steps_done // 2
+
+
 RESUME = """
 import sys
 from pathlib import Path

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.readers.text import DECIMALS, TimeUnit
-from ebarf_ns.events.source import Piece, Source, numbered
+from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
+from ebarf_ns.files import opened_npz
 
 _EVENTS_AT_ONCE = 1 << 20
+_EXACT = 2.0**53  # floats beyond are no exact integers
 _NAMES = {
     "x": ("x", "xs"), "y": ("y", "ys"), "t": ("t", "ts", "timestamp", "timestamps", "t_us", "t_ns"),
     "p": ("p", "ps", "pol", "polarity"),
@@ -26,38 +26,44 @@ def read_npz(path: Path, time_unit: TimeUnit | None = None) -> Source:
     they are floats, and else microseconds, unless ``time_unit`` says otherwise.
     """
     try:
-        with np.load(path) as file:
-            columns = {name: file[name] for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise RecordingError(f"{path}: not a whole npz file of plain arrays ({error})") from None
-    names = ", ".join(columns) or "none"
-    robust = "position" in columns
-    if robust and columns["position"].ndim == 2 and columns["position"].shape[1] == 2:
-        columns["x"], columns["y"] = columns["position"].T
-    chosen = {role: next((name for name in names if name in columns), None) for role, names in _NAMES.items()}
-    if None in chosen.values():
-        raise RecordingError(f"{path}: arrays {names}, expected x, y (or position), t and p")
-    x, y, t, p = (columns[chosen[role] or ""] for role in "xytp")
+        with opened_npz(path) as file:
+            chosen = {role: next((name for name in names if name in file), None) for role, names in _NAMES.items()}
+            robust = "position" in file
+            if not (chosen["t"] and chosen["p"] and (robust or (chosen["x"] and chosen["y"]))):
+                names = ", ".join(file) or "none"
+                raise RecordingError(f"{path}: arrays {names}, expected x, y (or position), t and p")
+            t, p = file[chosen["t"]], file[chosen["p"]]
+            x, y = _columns(path, file["position"]) if robust else (file[chosen["x"]], file[chosen["y"]])
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}") from None
     unit = time_unit or ("ns" if robust or chosen["t"] == "t_ns" else "s" if t.dtype.kind == "f" else "us")
     return Source(path, f"npz, times in {unit}", None, _pieces(path, (x, y, t, p), unit))
 
 
-def read_npy_folder(folder: Path) -> Source:
-    """ESIM's and E-NeRF's ``*.npy`` files, by name: rows (x, y, t in nanoseconds, polarity)."""
-    files = sorted(folder.glob("*.npy"))
+def _columns(path: Path, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if position.ndim != 2 or position.shape[1] != 2:
+        raise RecordingError(f"{path}: position is of shape {position.shape}, expected (events, 2)")
+    return position[:, 0], position[:, 1]
+
+
+def read_npy(path: Path) -> Source:
+    """ESIM's and E-NeRF's ``*.npy`` files, by name, or one: rows (x, y, t in nanoseconds, polarity)."""
+    files = sorted(path.glob("*.npy")) if path.is_dir() else [path]
     if not files:
-        raise RecordingError(f"{folder}: holds no .npy file, expected rows of events in files by time")
-    return Source(folder, f"{len(files)} npy files, times in ns", None, _rows(files))
+        raise RecordingError(f"{path}: holds no .npy file, expected rows of events in files by time")
+    return Source(path, f"{len(files)} npy files, times in ns", None, _rows(files))
 
 
 def _rows(files: list[Path]) -> Iterator[Piece]:
     for path in files:
         try:
             rows = np.load(path, mmap_mode="r")
-        except (OSError, ValueError, EOFError) as error:
+        except Exception as error:
+            # NumPy reads the header as Python: what a damaged one makes it raise has no common kind.
             raise RecordingError(f"{path}: not a whole npy file of a plain array ({error})") from None
-        if rows.ndim != 2 or rows.shape[1] != 4:
-            raise RecordingError(f"{path}: an array of shape {rows.shape}, expected rows of x, y, t and polarity")
+        shape = getattr(rows, "shape", "none")
+        if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 4:
+            raise RecordingError(f"{path}: an array of shape {shape}, expected rows of x, y, t and polarity")
         yield from _pieces(path, tuple(rows.T), "ns")
 
 
@@ -75,18 +81,16 @@ def _integers(path: Path, column: np.ndarray, name: str, first: int) -> np.ndarr
     """As integers, which floats may be too, as in ESIM's rows."""
     if column.dtype.kind in "iub":
         return column.astype(np.uint8) if column.dtype == bool else np.asarray(column)
-    wrong = ~(np.isfinite(column) & (column == np.rint(column))) if column.dtype.kind == "f" else np.ones(1, bool)
-    if wrong.any():
-        row = int(wrong.argmax())
+    whole = (np.abs(column) < _EXACT) & (column == np.rint(column)) if column.dtype.kind == "f" else np.zeros(1, bool)
+    if not whole.all():
+        row = int(whole.argmin())
         raise RecordingError(f"{path}: {name} of row {first + row:,} is {column[row]!r:.30}, expected an integer")
     return column.astype(np.int64)
 
 
 def _microseconds(path: Path, t: np.ndarray, unit: TimeUnit, first: int) -> np.ndarray:
-    decimals = DECIMALS[unit]
-    if t.dtype.kind in "iu":
-        # Rounded to the nearest, exactly.
-        return t.astype(np.int64) * 10**decimals if decimals >= 0 else (t.astype(np.int64) + 500) // 1000
-    if t.dtype.kind != "f" or not np.isfinite(t).all():
-        raise RecordingError(f"{path}: times from row {first:,} on are {t.dtype} or not finite, expected numbers")
-    return np.rint(t.astype(np.float64) * 10.0**decimals).astype(np.int64)
+    if t.dtype.kind not in "iuf" or not fits(t, unit).all():
+        raise RecordingError(
+            f"{path}: times from row {first:,} on are {t.dtype} or too large, expected times in {unit}"
+        )
+    return microseconds(t, unit)

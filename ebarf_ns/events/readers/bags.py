@@ -10,6 +10,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -38,29 +39,34 @@ _MONO_EVENT = np.dtype([("t_ns", "<u4"), ("x", "<u2"), ("y_p", "<u2")])
 def read_bag(path: Path, topic: str | None = None) -> Source:
     """The events of ``topic``, or of the only topic that has any; raises :class:`RecordingError`."""
     with _opened(path) as bag:
-        topics = {
-            connection.topic: connection.msgtype
-            for connection in bag.connections
-            if connection.msgtype in _ARRAYS + _PACKETS
-        }
-        if topic is None and len(topics) != 1:
-            everything = ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in bag.connections)) or "none"
-            raise RecordingError(
-                f"{path}: {len(topics)} topics have events, expected one, or --topic to choose; topics: {everything}"
-            )
-        if topic is not None and topic not in topics:
-            raise RecordingError(f"{path}: topic {topic} has no events, expected one of {', '.join(topics) or 'none'}")
-        topic = topic or next(iter(topics))
-        connections = [connection for connection in bag.connections if connection.topic == topic]
+        connections = _of_events(path, bag, topic)
         size = next((_sensor_size(bag, raw, one) for one, _, raw in bag.messages(connections)), None)
+        name = f"ROS {2 if bag.is2 else 1} bag, {connections[0].msgtype} of {connections[0].topic}"
     dropped: Counter[str] = Counter()
-    name = f"ROS {2 if path.suffix != '.bag' else 1} bag, {topics[topic]} of {topic}"
     return Source(path, name, size, _pieces(path, topic, dropped), dropped)
+
+
+def _of_events(path: Path, bag: AnyReader, topic: str | None) -> list[Any]:
+    """The connections of the topic that is asked for, or of the only one with events."""
+    topics = {one.topic for one in bag.connections if one.msgtype in _ARRAYS + _PACKETS}
+    if topic is None and len(topics) != 1:
+        everything = ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in bag.connections)) or "none"
+        raise RecordingError(
+            f"{path}: {len(topics)} topics have events, expected one, or --part to choose; topics: {everything}"
+        )
+    if topic is not None and topic not in topics:
+        raise RecordingError(f"{path}: topic {topic} has no events, expected one of {', '.join(topics) or 'none'}")
+    return [one for one in bag.connections if one.topic in topics and one.topic == (topic or one.topic)]
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[AnyReader]:
     """The bag; whatever a damaged one makes the library do, for it promises no kind of exception, is one line."""
+    if path.is_file() and path.suffix != ".bag":
+        # A ROS 2 bag is a folder, and one of ROS 1 is known by its suffix.
+        if not (path.parent / "metadata.yaml").is_file():
+            raise RecordingError(f"{path}: no metadata.yaml beside it, expected a ROS 2 bag's folder or a .bag file")
+        path = path.parent
     try:
         with AnyReader([path]) as bag:
             yield bag
@@ -70,10 +76,10 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         raise RecordingError(f"{path}: not a whole bag ({type(error).__name__}: {error})") from None
 
 
-def _pieces(path: Path, topic: str, dropped: Counter[str]) -> Iterator[Piece]:
+def _pieces(path: Path, topic: str | None, dropped: Counter[str]) -> Iterator[Piece]:
     decoder: Decoder | None = None
     with _opened(path) as bag:
-        connections = [connection for connection in bag.connections if connection.topic == topic]
+        connections = _of_events(path, bag, topic)
         for number, (connection, _, raw) in enumerate(bag.messages(connections)):
             place = _place_in(number)
             if connection.msgtype in _ARRAYS:
@@ -153,14 +159,20 @@ def _mono(packet: Any, place: Callable[[int], str]) -> Piece:
     return Piece(events["x"], events["y_p"] & 0x7FFF, t_us, (events["y_p"] >> 15).astype(np.int8), place)
 
 
-def read_bag_frames(path: Path, size: tuple[int, int]) -> Iterator[tuple[int, np.ndarray]]:
-    """8-bit grey images as large as the event sensor, which only its own are, with their times in microseconds."""
+def read_bag_frames(path: Path, size: tuple[int, int], topic: str | None = None) -> Iterator[tuple[int, np.ndarray]]:
+    """8-bit grey images as large as the event sensor, with their times in microseconds: those of the topic whose name
+    is most like that of the events' (of two sensors in a bag, either has its own)."""
     with _opened(path) as bag:
-        connections = [one for one in bag.connections if one.msgtype == "sensor_msgs/msg/Image"]
-        if not connections:
-            return
-        for connection, _, raw in bag.messages(connections):
-            image: Any = bag.deserialize(raw, connection.msgtype)
-            if (image.width, image.height) == size and image.encoding in ("mono8", "8UC1"):
+        events = _of_events(path, bag, topic)[0].topic
+        images = [one for one in bag.connections if one.msgtype == "sensor_msgs/msg/Image"]
+        for name in sorted({one.topic for one in images}, key=lambda name: (-len(commonprefix([name, events])), name)):
+            found = False
+            for connection, _, raw in bag.messages([one for one in images if one.topic == name]):
+                image: Any = bag.deserialize(raw, connection.msgtype)
+                if (image.width, image.height) != size or image.encoding not in ("mono8", "8UC1"):
+                    break
+                found = True
                 grey = np.asarray(image.data, np.uint8).reshape(image.height, image.step)[:, : image.width]
                 yield image.header.stamp.sec * 10**6 + (image.header.stamp.nanosec + 500) // 1000, grey
+            if found:
+                return

@@ -16,7 +16,7 @@ import numpy as np
 
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.readers import ecf
-from ebarf_ns.events.source import Piece, Source, numbered
+from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 
 with suppress(ImportError):
     import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5
@@ -31,15 +31,19 @@ _DAMAGES = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeErr
 Columns = dict[str, h5py.Dataset | tuple[h5py.Dataset, str]]
 
 
-def read_hdf5(path: Path, group: str | None = None) -> Source:
-    """The events of ``group``, or of the only group that has any; raises :class:`RecordingError`."""
+def read_hdf5(path: Path, group: str | None = None, time_unit: TimeUnit | None = None) -> Source:
+    """The events of ``group``, or of the only group that has any; raises :class:`RecordingError`.
+
+    Times are microseconds where they are integers and seconds where they are floats, unless ``time_unit`` says
+    otherwise; ``t_offset`` and Prophesee's compressed tables are in microseconds.
+    """
     try:
         with h5py.File(path, "r") as file:
             name = _choose(path, _groups(file), group)
             size = _sensor_size(file, name)
     except _DAMAGES as error:
         raise RecordingError(f"{path}: not a whole HDF5 file ({_one_line(error)})") from None
-    return Source(path, f"HDF5, events in /{name}", size, _pieces(path, name))
+    return Source(path, f"HDF5, events in /{name}", size, _pieces(path, name, time_unit))
 
 
 def _groups(file: h5py.File) -> dict[str, Columns]:
@@ -74,7 +78,7 @@ def _choose(path: Path, groups: dict[str, Columns], wanted: str | None) -> str:
         return name
     if len(groups) != 1:
         raise RecordingError(
-            f"{path}: {len(groups)} groups hold events ({_listed(groups)}), expected one, or --group to choose"
+            f"{path}: {len(groups)} groups hold events ({_listed(groups)}), expected one, or --part to choose"
             if groups
             else f"{path}: no group has columns x, y, t and p of one dimension; expected the events in one"
         )
@@ -98,7 +102,7 @@ def _sensor_size(file: h5py.File, name: str) -> tuple[int, int] | None:
     return None
 
 
-def _pieces(path: Path, group: str) -> Iterator[Piece]:
+def _pieces(path: Path, group: str, time_unit: TimeUnit | None) -> Iterator[Piece]:
     try:
         with h5py.File(path, "r") as file:
             columns = _columns_of(file[group] if group else file)  # pyright: ignore[reportArgumentType]
@@ -111,7 +115,7 @@ def _pieces(path: Path, group: str) -> Iterator[Piece]:
                 return
             for first in range(0, count, _EVENTS_AT_ONCE):
                 x, y, t, p = (_slice(columns[role], first) for role in "xytp")
-                t_us = _microseconds(path, group, t, first)
+                t_us = _microseconds(path, group, t, first, time_unit)
                 yield Piece(x, y, t_us + offset_us if offset_us else t_us, p, numbered(first, "row"))
     except _DAMAGES as error:
         raise RecordingError(f"{path}: /{group} cannot be read ({_one_line(error)})") from None
@@ -165,11 +169,10 @@ def _check(path: Path, group: str, columns: Columns) -> None:
             raise RecordingError(f"{path}: /{group} has {role} of type {dtype}, expected integers (t: or float64)")
 
 
-def _microseconds(path: Path, group: str, t: np.ndarray, first: int) -> np.ndarray:
-    """Integers are microseconds, float64 are seconds."""
-    if t.dtype.kind != "f":
-        return t.astype(np.int64, copy=False)
-    if not np.isfinite(t).all() or np.abs(t).max(initial=0) > 1e12:
-        row = int(np.argmax(~(np.abs(t) <= 1e12)))
-        raise RecordingError(f"{path}: /{group} row {first + row:,} is at {t[row]} s, expected a finite time")
-    return np.rint(t * 1e6).astype(np.int64)
+def _microseconds(path: Path, group: str, t: np.ndarray, first: int, time_unit: TimeUnit | None) -> np.ndarray:
+    unit = time_unit or ("s" if t.dtype.kind == "f" else "us")
+    possible = fits(t, unit) if t.dtype.kind == "f" or unit != "us" else np.ones(1, bool)
+    if not possible.all():
+        row = int(possible.argmin())
+        raise RecordingError(f"{path}: /{group} row {first + row:,} is at {t[row]} {unit}, expected a finite time")
+    return microseconds(t, unit)

@@ -10,26 +10,26 @@ import re
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.source import Piece, Source
+from ebarf_ns.events.source import DECIMALS, Piece, Source, TimeUnit
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
-DECIMALS: dict[TimeUnit, int] = {"s": 6, "ms": 3, "us": 0, "ns": -3}
-"""By which power of ten a time becomes microseconds."""
 _BLOCK_BYTES = 1 << 22
 _TIME, _X, _Y, _POLARITY, _LINE, _TABLE = range(6)
 _ROLES = {
     "t": _TIME, "ts": _TIME, "time": _TIME, "timestamp": _TIME, "timestamps": _TIME, "x": _X, "y": _Y, "p": _POLARITY,
     "pol": _POLARITY, "polarity": _POLARITY, "on": _POLARITY,
 }  # fmt: skip
+# The micro sign, and the Greek letter that looks like it.
 _UNITS: dict[str, TimeUnit] = {
-    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"
+    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "milliseconds": "ms", "us": "us",
+    "\u00b5s": "us", "\u03bcs": "us", "usec": "us", "microseconds": "us", "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
 }  # fmt: skip
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _SIGNIFICANT = 18  # digits that fit int64
 _UNUSED = -1
 
@@ -38,12 +38,15 @@ class _Layout(NamedTuple):
     roles: tuple[int, ...]
     """Of each column."""
     unit: TimeUnit
+    guessed: bool
+    """Whether nothing but the look of the first times says so."""
     sensor_size: tuple[int, int] | None
     header_lines: int
 
 
 def read_text(path: Path, time_unit: TimeUnit | None = None) -> Source:
-    """Times are seconds where they have a point, else microseconds, unless their name or ``time_unit`` says otherwise.
+    """Times are seconds where one of the first has a point, else microseconds, unless their name or ``time_unit`` says
+    otherwise.
 
     Raises :class:`RecordingError` with file, line, text and expectation; nothing is repaired or dropped.
     """
@@ -55,18 +58,20 @@ def read_text(path: Path, time_unit: TimeUnit | None = None) -> Source:
 def _layout(path: Path, time_unit: TimeUnit | None) -> _Layout:
     """What the first lines say about the others."""
     size, roles, unit = None, (_TIME, _X, _Y, _POLARITY), None
-    for number, fields in _first_lines(path):
+    lines = list(_first_lines(path))
+    for place, (number, fields) in enumerate(lines):
         numeric = [_decimal(field) for field in fields]
         if None in numeric and roles == (_TIME, _X, _Y, _POLARITY) and unit is None:
-            roles, unit = _named_columns(path, number, fields)
+            roles, unit = _named_columns(path, number, fields, time_unit)
             continue
         if len(fields) == 2 and size is None and None not in numeric:
             size = int(numeric[0] or 0), int(numeric[1] or 0)
             continue
         column = roles.index(_TIME)
-        time = fields[column] if column < len(fields) else ""
-        found: TimeUnit = "s" if re.search("[.eE]", time) else "us"
-        return _Layout(roles, time_unit or unit or found, size, number - 1)
+        times = [fields[column] for _, fields in lines[place:] if column < len(fields)]
+        found: TimeUnit = "s" if any(re.search("[.eE]", time) for time in times) else "us"
+        unit = time_unit or unit
+        return _Layout(roles, unit or found, unit is None, size, number - 1)
     raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
 
 
@@ -77,7 +82,9 @@ def _first_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                 line = file.readline(1 << 16)
                 if not line:
                     return
-                fields = re.split(r"[\s,;]+", line.decode("latin-1").split("#")[0].strip(" \t\r\n,;"))
+                text = line.decode("utf-8-sig", errors="replace").split("#")[0].strip(" \t\r\n,;")
+                # A unit goes with its name: "time (us)".
+                fields = re.split(r"[\s,;]+", re.sub(r"\s+(?=[\[(])", "", text))
                 if fields != [""]:
                     yield number, fields
     except OSError as error:
@@ -91,14 +98,19 @@ def _decimal(text: str) -> Decimal | None:
         return None
 
 
-def _named_columns(path: Path, number: int, fields: list[str]) -> tuple[tuple[int, ...], TimeUnit | None]:
-    unit: TimeUnit | None = None
+def _named_columns(
+    path: Path, number: int, fields: list[str], time_unit: TimeUnit | None
+) -> tuple[tuple[int, ...], TimeUnit | None]:
+    unit = time_unit
     roles = []
     for field in fields:
         name, _, of = field.lower().strip("\"'").replace("[", "_").rstrip("])").replace("(", "_").partition("_")
         role = _ROLES.get(name, _UNUSED)
-        if role == _TIME and of in _UNITS:
+        if role == _TIME and time_unit is None and of in _UNITS:
             unit = _UNITS[of]
+        elif role == _TIME and time_unit is None and re.search(r"[\[(].*\w", field):
+            known = ", ".join(_UNITS)
+            raise RecordingError(f"{path}:{number}: times in {of!r:.20}, expected one of {known}, or --event-time-unit")
         roles.append(role)
     if sorted(role for role in roles if role != _UNUSED) != [_TIME, _X, _Y, _POLARITY]:
         raise RecordingError(f"{path}:{number}: columns {' '.join(fields)!r:.60}, expected t, x, y and p once each")
@@ -109,12 +121,15 @@ def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
     roles = np.array(layout.roles)
     for block, line in _line_blocks(path, layout.header_lines):
         content = np.frombuffer(block, np.uint8)
-        table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], block.count(b"\n") + 1)
+        # Fractions of what was taken for microseconds are seconds after all.
+        exact = layout.guessed and layout.unit == "us"
+        table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], not exact, block.count(b"\n") + 1)
         if bad_line:
             text = block.split(b"\n")[bad_line - line].decode(errors="replace").strip()
             columns = {_TIME: f"t[{layout.unit}]", _X: "x", _Y: "y", _POLARITY: "p", _UNUSED: "-"}
             names = " ".join(columns[role] for role in layout.roles)
-            raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'")
+            hint = ", or --event-time-unit" if exact else ""
+            raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'{hint}")
         if len(table):
             t_us, x, y, polarity, lines = table.T
             yield Piece(x, y, np.ascontiguousarray(t_us), polarity, lambda k, lines=lines: f"line {lines[k]:,}")
@@ -124,6 +139,8 @@ def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
     """Blocks of whole lines, each with the number of its first line."""
     line, rest = 1 + header_lines, b""
     with path.open("rb") as file:
+        if file.read(len(_BYTE_ORDER_MARK)) != _BYTE_ORDER_MARK:
+            file.seek(0)
         for _ in range(header_lines):
             file.readline()
         while content := file.read(_BLOCK_BYTES):
@@ -136,7 +153,7 @@ def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
 
 
 @njit(cache=True)
-def _parse(content, first_line, roles, time_decimals, most):
+def _parse(content, first_line, roles, time_decimals, round_times, most):
     """Rows (t_us, x, y, p, line), and the number of the first malformed line or 0."""
     table = np.empty((most, _TABLE), np.int64)
     count = 0
@@ -153,7 +170,7 @@ def _parse(content, first_line, roles, time_decimals, most):
             if column >= len(roles):
                 return table[:count], line
             role = roles[column]
-            value, i, ok = _number(content, i, time_decimals if role == _TIME else 0, role == _TIME)
+            value, i, ok = _number(content, i, time_decimals if role == _TIME else 0, role == _TIME and round_times)
             if role != _UNUSED:
                 if not ok or (value < 0 and (role == _X or role == _Y)):
                     return table[:count], line
