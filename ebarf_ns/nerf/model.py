@@ -55,9 +55,6 @@ class EbarfModelConfig(ModelConfig):
     """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
     learn_sensor: bool = True
     """With Eq. 5: learn the ratio of the contrast thresholds, or take them as given."""
-    ratio_prior: float = 0.003
-    """How much the ratio of thresholds that are given counts beside the events, all of which count as 1; 0: not at
-    all."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -110,7 +107,6 @@ class EbarfModel(Model):
         given = scene.contrast_threshold or _UNKNOWN_THRESHOLDS
         on, off = (1.0, 1.0) if self.normalized else (given.on, given.off)
         self.sensor = SensorResponse(on, off, config.learn_sensor and not self.normalized)
-        self.ratio_prior = config.ratio_prior if self.sensor.learned and scene.contrast_threshold else 0.0
         self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
             levels=_planned(config.grid_levels),
@@ -200,8 +196,6 @@ class EbarfModel(Model):
                 self.config.render_variance,
             )
         losses = {"event_loss": loss}
-        if self.ratio_prior:
-            losses["ratio_prior"] = self.ratio_prior * loss.detach() * self.sensor.implausibility()
         self.camera_optimizer.get_loss_dict(losses)
         return losses
 

@@ -56,7 +56,6 @@ _LEAST = {
     "pipeline.model.most_hidden": 1e-6,
     "pipeline.model.outliers_from": 1e-3,
     "pipeline.model.render_variance": 0,
-    "pipeline.model.ratio_prior": 0,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
     "pipeline.model.camera_optimizer.keyframe_stride": 1,

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-
 _MOST_HALF_LOG_RATIO = math.log(3) / 2
-_GOOD_LOG_RATIO = 0.01
 
 
 class Response(NamedTuple):
@@ -45,12 +41,3 @@ class SensorResponse(nn.Module):
             return self.nominal
         uneven = torch.exp(_MOST_HALF_LOG_RATIO * torch.tanh(self.half_log_ratio / _MOST_HALF_LOG_RATIO))
         return Response(self.nominal.threshold_on * uneven, self.nominal.threshold_off / uneven)
-
-    def implausibility(self) -> Float[Tensor, ""]:
-        """What speaks for the nominal ratio: it is off by some percent, but nobody knows by how many.
-
-        If that number may be of any size, from one percent on, a logarithm x of the ratio over the nominal one costs
-        log(1 + (x / 0.01)²): a large one next to nothing, while a ratio that was right stays where it is. The events
-        alone leave it open to half a percent: a field can grow a little brighter along the way.
-        """
-        return torch.log1p((2 * self.half_log_ratio / _GOOD_LOG_RATIO) ** 2)

@@ -67,7 +67,7 @@ class EventSensor:
         self._noise_hz[self._random.permutation(count)[: model.hot_pixels]] += model.hot_pixel_hz
         # Every sample is kept as (time, what comes in, what the low pass lets through).
         self._t_us, self._input, self._output = np.zeros(count), log_brightness.copy(), log_brightness.copy()
-        # Switched on long ago: levels lie anywhere within a threshold of the brightness.
+        # Switched on long ago: levels lie anywhere within a threshold of the brightness, in the same way for all seeds.
         phase = np.random.default_rng(0).uniform(-1, 1, count)
         self.level = log_brightness + phase * self._growth(0) * np.where(
             phase > 0, self.threshold_off, self.threshold_on

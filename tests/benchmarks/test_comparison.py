@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.scene import Scene, read_scene
 from tests.conftest import run_command, run_ok
 
@@ -96,6 +98,20 @@ def test_a_scene_made_anew_is_measured_anew(comparison: Path, tmp_path: Path):
             file.write(line)
         run_command("ebarf", "bench", tmp_path / "given.yaml", "--output", tmp_path / "out")
         assert len(list((tmp_path / "out" / "results").iterdir())) == number + 1
+
+
+def test_bounds_of_another_world_than_the_groundtruths_are_named(comparison: Path, tmp_path: Path):
+    folder = shutil.copytree(made(comparison, "drift").events.parent, tmp_path / "scene")
+    path = read_scene(folder).groundtruth
+    assert path
+    true = read_tum(path)
+    write_tum(path, Trajectory(true.t_us, Poses(true.poses.position + 10, true.poses.quat_wxyz)))
+    (tmp_path / "given.yaml").write_text(
+        f"methods: {{ebarf: ebarf}}\nscenes: {{given: {folder}}}\n"
+        "trajectories: {drift: {position_drift: 0.05}}\nseeds: [0]\nseconds: [1]\n"
+    )
+    finished = run_command("ebarf", "bench", tmp_path / "given.yaml", "--output", tmp_path / "out")
+    assert finished.code == 2 and "expected both in one world" in finished.errors
 
 
 def test_another_program_joins_by_its_files(comparison: Path, tmp_path: Path):

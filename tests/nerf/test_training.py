@@ -99,7 +99,6 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
         made = config(scene, tmp_path / f"run, told {told}", steps=1500)
         # What a field cannot show is missing in the changes that tell the ratio.
         model = made.pipeline.model
-        model.ratio_prior = 0.0  # pyright: ignore[reportAttributeAccessIssue]
         model.grid_table_size_log2, model.grid_levels, model.grid_finest, model.samples = 14, 6, 128, 24  # pyright: ignore[reportAttributeAccessIssue]
         ready = trainer(made)
         ready.train()
