@@ -165,7 +165,7 @@ def robust_e_nerf(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     return Ingredients(lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, (), threshold, notes)
 
 
-LAYOUTS: dict[Layout, Callable[..., Ingredients]] = {
+LAYOUTS: dict[Layout, Callable[[Path, Given], Ingredients]] = {
     "ecd": ecd, "tumvie": tumvie, "eds": eds, "esim": esim, "robust-e-nerf": robust_e_nerf
 }  # fmt: skip
 

@@ -125,13 +125,14 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
     made_of = _contents(scene), errors
     if errors is None:
         return source, made_of
-    _check_bounds_are_of_reference(scene)
     made = folder / "scenes" / _named(f"{job.scene}-{job.seed}-{job.trajectory}", made_of, job.seed)
     if not (made / "scene.json").is_file():
+        true = _true_keyframes(scene)
+        _check_bounds_are_of_reference(scene, true)
         with whole_folder(made) as temporary:
             # Everything else stays where it is.
             trajectory = temporary / "trajectory.txt"
-            write_tum(trajectory, perturb(_true_keyframes(scene), errors, job.seed))
+            write_tum(trajectory, perturb(true, errors, job.seed))
             lower_upper = scene.bounds and tuple(tuple(errors.scale * one for one in corner) for corner in scene.bounds)
             write_scene(replace(scene, folder=temporary, trajectory=trajectory, bounds=lower_upper or None))
     return made, made_of
@@ -152,11 +153,11 @@ def _true_keyframes(scene: Scene) -> Trajectory:
     return Trajectory(t_us, interpolate(reference.t_us, reference.poses, t_us))
 
 
-def _check_bounds_are_of_reference(scene: Scene) -> None:
+def _check_bounds_are_of_reference(scene: Scene, true: Trajectory) -> None:
     """Bounds are of the world of the scene's own trajectory; others, made of the reference, must be in the same one."""
     if scene.bounds is None:
         return
-    true, own = _true_keyframes(scene), read_tum(scene.trajectory)
+    own = read_tum(scene.trajectory)
     apart = interpolate(own.t_us, own.poses, true.t_us).position - true.poses.position
     off, size = float(apart.norm(dim=-1).median()), float(np.diff(scene.bounds, axis=0).max())
     if off > _ANOTHER_WORLD * size:

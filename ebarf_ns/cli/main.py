@@ -93,10 +93,10 @@ class Inspect:
 
     def run(self) -> None:
         """Print the summary."""
+        from ebarf_ns.events.recognise import recognised_folder
+
         # A folder that is neither is taken for a scene, and told what it lacks.
-        if not (self.scene / "scene.json").exists() and (
-            self.scene.is_file() or (self.scene / "metadata.yaml").exists() or any(self.scene.glob("*.npy"))
-        ):
+        if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
             summary = self._recording()
         else:
             summary = self._scene()

@@ -336,7 +336,7 @@ def _spread(values: Sequence[float]) -> str:
     """Median and quartiles, where all of them are known."""
     if not np.isfinite(values).all():
         return "-"
-    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    low, middle, high = quartiles(values)
     return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
 
 

@@ -52,13 +52,18 @@ def open_recording(
     return read_text(path, time_unit)
 
 
+def recognised_folder(path: Path) -> RecordingFormat | None:
+    """The recording that a folder is, if it is one."""
+    if (path / "metadata.yaml").is_file():
+        return "bag"
+    return "npy" if any(path.glob("*.npy")) else None
+
+
 def recognised(path: Path) -> RecordingFormat:
     """What a file or folder is; raises :class:`RecordingError` where it is none of those."""
     if path.is_dir():
-        if (path / "metadata.yaml").is_file():
-            return "bag"
-        if any(path.glob("*.npy")):
-            return "npy"
+        if found := recognised_folder(path):
+            return found
         raise RecordingError(f"{path}: a folder without metadata.yaml (ROS 2) or .npy files, expected a recording")
     try:
         with path.open("rb") as file:

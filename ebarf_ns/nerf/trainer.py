@@ -164,7 +164,6 @@ class EbarfTrainer(Trainer):
         self.train_seconds = 0.0
         self.event_pairs = 0
         self.steps_done = 0
-        self._metric_lines: list[str] = []
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
             for flag in ("max_num_iterations", "max_train_seconds"):
@@ -310,18 +309,17 @@ class EbarfTrainer(Trainer):
         lines = path.read_text(encoding="utf-8").splitlines() if goes_on else [json.dumps(self._header())]
         header, *records = lines
         # What was evaluated after the checkpoint will be again.
-        self._metric_lines = [header, *(record for record in records if json.loads(record)["step"] <= self._start_step)]
-        self._write_metrics()
+        records = [record for record in records if json.loads(record)["step"] <= self._start_step]
+        with whole_file(path) as temporary:
+            temporary.write_text("\n".join([header, *records]) + "\n", encoding="utf-8")
 
     @check_main_thread
     def _record_metrics(self, record: dict[str, Any]) -> None:
-        self._metric_lines.append(json.dumps(record))
-        self._write_metrics()
-
-    def _write_metrics(self) -> None:
-        # All of it each time: what ends a run in the middle of a line would leave a file that nothing reads.
-        with whole_file(self.base_dir / "metrics.jsonl") as temporary:
-            temporary.write_text("\n".join(self._metric_lines) + "\n", encoding="utf-8")
+        # All of it anew: what ends a run in the middle of a line would leave a file that nothing reads.
+        path = self.base_dir / "metrics.jsonl"
+        before = path.read_text(encoding="utf-8") if path.is_file() else ""
+        with whole_file(path) as temporary:
+            temporary.write_text(before + json.dumps(record) + "\n", encoding="utf-8")
 
     def _header(self) -> dict[str, Any]:
         device = torch.cuda.get_device_name() if self.device.startswith("cuda") else platform.processor() or "cpu"

@@ -171,8 +171,8 @@ def _check(path: Path, group: str, columns: Columns) -> None:
 
 def _microseconds(path: Path, group: str, t: np.ndarray, first: int, time_unit: TimeUnit | None) -> np.ndarray:
     unit = time_unit or ("s" if t.dtype.kind == "f" else "us")
-    possible = fits(t, unit) if t.dtype.kind == "f" or unit != "us" else np.ones(1, bool)
-    if not possible.all():
+    # Integers of microseconds always do.
+    if (t.dtype.kind == "f" or unit != "us") and not (possible := fits(t, unit)).all():
         row = int(possible.argmin())
         raise RecordingError(f"{path}: /{group} row {first + row:,} is at {t[row]} {unit}, expected a finite time")
     return microseconds(t, unit)

@@ -106,11 +106,11 @@ def _named_columns(
     for field in fields:
         name, _, of = field.lower().strip("\"'").replace("[", "_").rstrip("])").replace("(", "_").partition("_")
         role = _ROLES.get(name, _UNUSED)
-        if role == _TIME and time_unit is None and of in _UNITS:
-            unit = _UNITS[of]
-        elif role == _TIME and time_unit is None and re.search(r"[\[(].*\w", field):
-            known = ", ".join(_UNITS)
-            raise RecordingError(f"{path}:{number}: times in {of!r:.20}, expected one of {known}, or --event-time-unit")
+        if role == _TIME and time_unit is None:
+            unit = _UNITS.get(of)
+            if unit is None and re.search(r"[\[(].*\w", field):
+                expected = f"one of {', '.join(_UNITS)}, or --event-time-unit"
+                raise RecordingError(f"{path}:{number}: times in {of!r:.20}, expected {expected}")
         roles.append(role)
     if sorted(role for role in roles if role != _UNUSED) != [_TIME, _X, _Y, _POLARITY]:
         raise RecordingError(f"{path}:{number}: columns {' '.join(fields)!r:.60}, expected t, x, y and p once each")
