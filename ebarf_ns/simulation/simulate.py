@@ -49,7 +49,8 @@ class Simulation:
     lens: CameraModel = "pinhole"
     distortion: tuple[float, ...] = ()
     """Coefficients of the lens: k1 k2 p1 p2 [k3] of radtan, k1 k2 k3 k4 of equidistant."""
-    rays_per_pixel: Literal[1, 4, 16] = 4
+    rays_per_pixel: Literal[1, 4, 16] = 16
+    """Over which a pixel averages: with fewer, a sharp edge comes in jumps of several events at once."""
     sensor: SensorModel = field(default_factory=SensorModel)
     """What a pixel does."""
     tell_thresholds: bool = True
