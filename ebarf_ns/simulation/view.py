@@ -45,7 +45,7 @@ class View:
     surroundings: Surroundings
     motion: Motion
     camera: Camera
-    rays_per_pixel: int = 4
+    rays_per_pixel: int = 16
     """1, 4 or 16, over which a pixel's radiance is averaged."""
 
     def see(

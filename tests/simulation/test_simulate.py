@@ -47,8 +47,8 @@ def test_events_agree_with_the_room_seen_from_the_true_poses(tiny_scene: Path):
     def log_radiance(t_us: np.ndarray) -> np.ndarray:
         poses = interpolate(truth.t_us, truth.poses, torch.from_numpy(t_us), "cubic")
         directions = (corners @ quat_wxyz_to_matrix(poses.quat_wxyz).mT).flatten(0, 1).numpy()
-        radiance, _ = Room().cast(poses.position.repeat_interleave(4, dim=0).numpy(), directions)
-        return np.log(radiance.reshape(-1, 4).mean(axis=1))
+        radiance, _ = Room().cast(poses.position.repeat_interleave(corners.shape[1], dim=0).numpy(), directions)
+        return np.log(radiance.reshape(corners.shape[:2]).mean(axis=1))
 
     change = log_radiance(pairs.t1_us) - log_radiance(pairs.t0_us)
     reported = pairs.polarity_sum * scene.contrast_threshold.on

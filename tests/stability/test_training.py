@@ -31,7 +31,7 @@ from tests.conftest import REPOSITORY
 from tests.nerf.test_training import config, same, state, trainer
 
 KILLS = 50
-STEPS, RAYS = 80, 1024
+STEPS, RAYS = 100, 1024
 UNITS_AGREE = 0.15
 FAR_AGREES = 0.25
 LEARNED, SOMETHING_LEARNED, NOTHING_LEARNED = 0.5, 0.95, 0.5
