@@ -107,8 +107,8 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
         ends.append(ready.pipeline.evaluate())
     told, found = ends
     # Trainings of so small a scene differ by half a decibel from time to time.
-    assert found["psnr"] == pytest.approx(told["psnr"], abs=2.0)
-    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.1)
+    assert found["psnr"] > told["psnr"] - 2.0
+    assert found["heldout_event_loss"] < 1.1 * told["heldout_event_loss"]
 
 
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):
