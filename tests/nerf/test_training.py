@@ -92,7 +92,7 @@ def test_wrong_ratio_of_the_thresholds_is_corrected(tmp_path: Path):
 @pytest.mark.slow
 def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
     sensor = SensorModel(threshold_on=0.4, threshold_off=0.25)
-    tiny = Simulation(width=48, height=36, focal_px=41.0, frames=3, sensor=sensor)
+    tiny = Simulation(width=48, height=36, focal_px=41.0, frames=3, rays_per_pixel=4, sensor=sensor)
     ends = []
     for told in (True, False):
         scene = simulate(replace(tiny, tell_thresholds=told), tmp_path / f"told {told}").folder
@@ -107,8 +107,8 @@ def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
         ends.append(ready.pipeline.evaluate())
     told, found = ends
     # Trainings of so small a scene differ by half a decibel from time to time.
-    assert found["psnr"] > told["psnr"] - 2.0
-    assert found["heldout_event_loss"] < 1.1 * told["heldout_event_loss"]
+    assert found["psnr"] == pytest.approx(told["psnr"], abs=2.0)
+    assert found["heldout_event_loss"] == pytest.approx(told["heldout_event_loss"], rel=0.1)
 
 
 def test_frames_outside_the_trajectory_are_placed_by_the_reference_and_reported_apart(tiny_scene: Path, tmp_path: Path):

@@ -31,12 +31,12 @@ from tests.conftest import REPOSITORY
 from tests.nerf.test_training import config, same, state, trainer
 
 KILLS = 50
-STEPS, RAYS = 100, 1024
+STEPS, RAYS = 80, 1024
 UNITS_AGREE = 0.15
 FAR_AGREES = 0.25
 LEARNED, SOMETHING_LEARNED, NOTHING_LEARNED = 0.5, 0.95, 0.5
 LOST_DEG = 10.0
-SMALL = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.4, frames=2)
+SMALL = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.4, frames=2, rays_per_pixel=4)
 
 
 @pytest.fixture(scope="module")
