@@ -12,11 +12,18 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
 from ebarf_ns.geometry.smoothing import smoothed
-from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix, rotate
+from ebarf_ns.geometry.so3 import (
+    quat_wxyz_conjugate,
+    quat_wxyz_log,
+    quat_wxyz_multiply,
+    quat_wxyz_to_matrix,
+    rotate,
+)
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate, intervals
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
 
-_GOOD_PX = 0.1
+_GOOD_PX = 0.4
+_SETTLED_STEP = 1000
 
 
 @dataclass
@@ -33,11 +40,11 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
-    prior: float = 0.005
-    """How much the trajectory that training begins from counts beside the events, all of which count as 1; 0: not at
-    all."""
+    prior: float = 0.01
+    """What leaving a good trajectory costs, at most; an event loss that explains nothing is 1; 0: nothing."""
     every: int = 2
-    """In every so many-th step the keyframes learn too; in the others the field alone does, which is quicker."""
+    """In every so many-th step, and from step 1,000 on in every so many-th of these, the keyframes learn too; in the
+    others the field alone does, which is quicker."""
     interpolation: Interpolation | None = None
     """Between keyframes: straight and at constant velocity (Eq. 3), or with velocities that run on through the
     keyframes; None: as planned."""
@@ -80,6 +87,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
         self.start_position: Tensor
         self.start_quat_wxyz: Tensor
+        self.smoothed_px2 = _apart(keyframes.poses, start) / self.pixel_rad**2
         knots = _every(config.keyframe_stride or 1, len(keyframes.t_us))
         # Between which knots each keyframe lies never changes.
         left, fraction = intervals(keyframes.t_us[knots], keyframes.t_us)
@@ -91,9 +99,10 @@ class TrajectoryOptimizer(CameraOptimizer):
             self.correction = nn.Parameter(torch.zeros(len(knots), 6))
 
     def begin_step(self, step: int) -> None:
-        """Let the keyframes learn in every so many-th step: their gradients make it a fifth longer."""
+        """Let the keyframes learn, or leave it: their gradients make a step a fifth longer."""
         if self.config.mode == "refine":
-            self.correction.requires_grad_(step % self.config.every == 0)
+            every = self.config.every ** (1 if step < _SETTLED_STEP else 2)
+            self.correction.requires_grad_(step % every == 0)
 
     def initial(self) -> Poses:
         """The keyframes as they came."""
@@ -154,15 +163,15 @@ class TrajectoryOptimizer(CameraOptimizer):
         return opengl_from_opencv(moved).to(camera_to_world)
 
     def get_loss_dict(self, loss_dict: dict) -> None:
-        """Adds what speaks for the trajectory at the start: it is off by some pixels, but nobody knows by how many.
+        """Adds what speaks for the trajectory as it came: it is good to a fraction of a pixel, or nobody knows how bad.
 
-        If that number may be of any size, from a tenth of a pixel on, corrections c cost log(1 + mean |c|² / 0.1²):
-        large ones next to nothing, while a good trajectory stays where a field that is yet to take shape would bend
-        it. The events' own loss says how noisy they are, and scales it.
+        Keyframes that are off by a mean square of m pixels, by smoothing and by corrections, cost m / (m + 0.4²) times
+        the prior (Geman and McClure, 1987). A good trajectory stays where a field that is yet to take shape would bend
+        it, and the more so as the events' own loss falls; nothing draws one back that was noisy, or drifted by pixels.
         """
         if self.config.mode == "refine" and self.config.prior:
-            size = torch.log1p(self.correction.square().sum(dim=-1).mean() / _GOOD_PX**2)
-            loss_dict["trajectory_prior"] = self.config.prior * loss_dict["event_loss"].detach() * size
+            off_px2 = self.smoothed_px2 + self.correction.square().sum(dim=-1).mean()
+            loss_dict["trajectory_prior"] = self.config.prior * off_px2 / (off_px2 + _GOOD_PX**2)
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
         """Mean size of the corrections, in pixels."""
@@ -174,6 +183,12 @@ class TrajectoryOptimizer(CameraOptimizer):
         """The corrections, under nerfstudio's name for camera parameters."""
         if self.config.mode == "refine":
             param_groups["camera_opt"] = [self.correction]
+
+
+def _apart(some: Poses, others: Poses) -> float:
+    """Mean squared distance of poses: of rotations in radians, and of positions."""
+    rotation = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(some.quat_wxyz), others.quat_wxyz))
+    return float((rotation.square() + (some.position - others.position).square()).sum(dim=-1).mean())
 
 
 def _every(stride: int, count: int) -> Int[Tensor, "knots"]:

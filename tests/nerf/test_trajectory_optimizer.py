@@ -42,27 +42,40 @@ def test_untouched_corrections_are_plain_zeros_and_change_nothing():
     assert type(fresh(torch.arange(COUNT))) is torch.Tensor
 
 
+def pull(made: TrajectoryOptimizer, size_px: float) -> float:
+    """How hard corrections of a size are drawn back to none."""
+    with torch.no_grad():
+        made.correction.fill_(size_px / 6**0.5)
+    losses: dict[str, torch.Tensor] = {}
+    made.get_loss_dict(losses)
+    return float(torch.autograd.grad(losses["trajectory_prior"], made.correction)[0].norm())
+
+
 def test_small_corrections_cost_and_large_ones_hardly_cost_more():
-    made, slopes = optimizer(), []
-    for size_px in (0.0, 0.05, 5.0, 50.0):
-        with torch.no_grad():
-            made.correction.fill_(size_px / 6**0.5)
-        losses = {"event_loss": torch.tensor(0.2, requires_grad=True)}
-        made.get_loss_dict(losses)
-        slope, of_events = torch.autograd.grad(
-            losses["trajectory_prior"], [made.correction, losses["event_loss"]], allow_unused=True
-        )
-        slopes.append(float(slope.norm()))
-        assert of_events is None
+    slopes = [pull(optimizer(), size_px) for size_px in (0.0, 0.05, 5.0, 50.0)]
     assert slopes[0] == 0 and slopes[1] > 20 * slopes[2] > 150 * slopes[3] > 0
 
 
-def test_keyframes_learn_in_every_so_many_th_step():
-    made, learn = optimizer(every=3), []
-    for step in range(7):
+def test_nothing_holds_keyframes_that_smoothing_has_moved_by_pixels():
+    line = torch.arange(40)[:, None] * torch.tensor([0.01, 0.0, 0.0])
+    upright = torch.tensor([1.0, 0, 0, 0]).expand(40, 4)
+    noise = torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
+    pulls = []
+    for noise_px in (0.0, 3.0):
+        path = Trajectory(torch.arange(40) * 50_000, Poses(line + noise_px / 100 * noise, upright))
+        made = TrajectoryOptimizerConfig().setup(num_cameras=40, device="cpu", keyframes=path, focal_px=100.0)
+        pulls.append(pull(made, 0.2))
+    assert pulls[0] > 500 * pulls[1] > 0
+
+
+@pytest.mark.parametrize("every, early, late", [(1, [0, 1, 2, 3], [1000, 1001, 1002]), (3, [0, 3, 6], [1008, 1017])])
+def test_keyframes_learn_in_every_so_many_th_step_and_less_often_later(every: int, early: list[int], late: list[int]):
+    made, learn = optimizer(every=every), []
+    for step in [*range(early[-1] + 1), *range(1000, late[-1] + 1)]:
         made.begin_step(step)
-        learn.append(made.poses_at(keyframes().t_us).position.requires_grad)
-    assert learn == [True, False, False, True, False, False, True]
+        if made.poses_at(keyframes().t_us).position.requires_grad:
+            learn.append(step)
+    assert learn == early + late
     optimizer(mode="off").begin_step(0)
 
 
