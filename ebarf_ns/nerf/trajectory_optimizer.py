@@ -41,7 +41,7 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
     prior: float = 0.01
-    """What leaving a good trajectory costs, at most; an event loss that explains nothing is 1; 0: nothing."""
+    """What leaving a good trajectory costs, at most, where a render wrong by a threshold costs 1; 0: nothing."""
     every: int = 2
     """In every so many-th step, and from step 1,000 on in every so many-th of these, the keyframes learn too; in the
     others the field alone does, which is quicker."""
