@@ -87,7 +87,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
         self.start_position: Tensor
         self.start_quat_wxyz: Tensor
-        self.smoothed_px2 = _apart(keyframes.poses, start) / self.pixel_rad**2
+        self.smoothed_px2 = _mean_squared_distance(keyframes.poses, start) / self.pixel_rad**2
         knots = _every(config.keyframe_stride or 1, len(keyframes.t_us))
         # Between which knots each keyframe lies never changes.
         left, fraction = intervals(keyframes.t_us[knots], keyframes.t_us)
@@ -185,7 +185,7 @@ class TrajectoryOptimizer(CameraOptimizer):
             param_groups["camera_opt"] = [self.correction]
 
 
-def _apart(some: Poses, others: Poses) -> float:
+def _mean_squared_distance(some: Poses, others: Poses) -> float:
     """Mean squared distance of poses: of rotations in radians, and of positions."""
     rotation = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(some.quat_wxyz), others.quat_wxyz))
     return float((rotation.square() + (some.position - others.position).square()).sum(dim=-1).mean())
