@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_log, quat_wxyz_multiply, rotate
+from ebarf_ns.geometry.so3 import rotate, turn_between
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate
 from ebarf_ns.radiance.field import fastest_precision
 from ebarf_ns.radiance.ray_sampling import Rays, leave_box
@@ -223,5 +223,5 @@ def _off_straight_px(trajectory: Trajectory, stride: int, focal_px: float, dista
     if distance is None:
         distance = 4 * float((position - position.mean(dim=0)).norm(dim=-1).max())
     moved = (line.position - position).norm(dim=-1) / max(distance, 1e-9)
-    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(line.quat_wxyz), trajectory.poses.quat_wxyz))
+    turn = turn_between(line.quat_wxyz, trajectory.poses.quat_wxyz)
     return float((moved + turn.norm(dim=-1)).square().mean().sqrt()) * focal_px

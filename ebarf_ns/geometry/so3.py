@@ -65,6 +65,11 @@ def quat_wxyz_conjugate(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "
     return torch.cat([quat_wxyz[..., :1], -quat_wxyz[..., 1:]], dim=-1)
 
 
+def turn_between(start: Float[Tensor, "*batch 4"], end: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """The rotation vector, in the start's frame, that turns one rotation into another; both are unit quaternions."""
+    return quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(start), end))
+
+
 def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """The rotation matrix of a unit quaternion."""
     identity = torch.eye(3, dtype=quat_wxyz.dtype, device=quat_wxyz.device)

@@ -13,14 +13,7 @@ import torch
 from torch import Tensor
 
 from ebarf_ns.errors import TrajectoryError
-from ebarf_ns.geometry.so3 import (
-    quat_wxyz_conjugate,
-    quat_wxyz_exp,
-    quat_wxyz_log,
-    quat_wxyz_multiply,
-    quat_wxyz_to_matrix,
-    rotate,
-)
+from ebarf_ns.geometry.so3 import quat_wxyz_exp, quat_wxyz_multiply, quat_wxyz_to_matrix, rotate, turn_between
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int64
@@ -103,7 +96,7 @@ def interpolate(
     left, exact_fraction = intervals(keyframe_t_us, t_us)
     u = exact_fraction.to(keyframes.position)[..., None]
     position, quat_wxyz = keyframes
-    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))
+    turn = turn_between(quat_wxyz[:-1], quat_wxyz[1:])
     change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)
     bends = _bends(keyframe_t_us, change) if kind == "cubic" else ()
     # Looked up together: every table that is looked up costs a pass over the gradients of all times.

@@ -12,13 +12,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
 from ebarf_ns.geometry.smoothing import smoothed
-from ebarf_ns.geometry.so3 import (
-    quat_wxyz_conjugate,
-    quat_wxyz_log,
-    quat_wxyz_multiply,
-    quat_wxyz_to_matrix,
-    rotate,
-)
+from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix, rotate, turn_between
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate, intervals
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
 
@@ -187,7 +181,7 @@ class TrajectoryOptimizer(CameraOptimizer):
 
 def _mean_squared_distance(some: Poses, others: Poses) -> float:
     """Mean squared distance of poses: of rotations in radians, and of positions."""
-    rotation = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(some.quat_wxyz), others.quat_wxyz))
+    rotation = turn_between(some.quat_wxyz, others.quat_wxyz)
     return float((rotation.square() + (some.position - others.position).square()).sum(dim=-1).mean())
 
 
