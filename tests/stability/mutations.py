@@ -32,7 +32,7 @@ FRACTION = "(t_us - keyframe_t_us[left]).double() / interval_us.double()"
 SAFE = "torch.where(small, torch.ones_like(angle_squared), angle_squared)"
 SINC = """    angle = torch.where(small, torch.ones_like(angle_squared), angle_squared).sqrt()
     series = 1 - angle_squared / 6"""
-TURN = "    turn = quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(quat_wxyz[:-1]), quat_wxyz[1:]))\n"
+TURN = "    turn = turn_between(quat_wxyz[:-1], quat_wxyz[1:])\n"
 SHORTER = "    quat_wxyz = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)\n"
 SLERP = "quat_wxyz_multiply(frame, quat_wxyz_exp(moved[..., :3])))"
 NLERP = "torch.nn.functional.normalize(torch.lerp(frame, quat_wxyz[left + 1], u), dim=-1))"
