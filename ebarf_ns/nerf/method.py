@@ -19,6 +19,8 @@ def _trainer(
     datamanager: EventDataManagerConfig,
     model: EbarfModelConfig,
     field_rate: float,
+    field_decay: float,
+    averaged_steps: int,
     poses: OptimizerConfig,
 ) -> EbarfTrainerConfig:
     return EbarfTrainerConfig(
@@ -31,11 +33,12 @@ def _trainer(
         steps_per_eval_all_images=10**9,
         steps_per_save=1000,
         mixed_precision=False,
+        averaged_steps=averaged_steps,
         pipeline=EbarfPipelineConfig(datamanager=datamanager, model=model),
         optimizers={
             "fields": {
                 "optimizer": FusedAdamConfig(lr=field_rate, eps=1e-15),
-                "scheduler": BudgetDecayConfig(),
+                "scheduler": BudgetDecayConfig(lr_final_ratio=field_decay),
             },
             "camera_opt": {
                 "optimizer": poses,
@@ -74,7 +77,15 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
     datamanager = EventDataManagerConfig(
         longest_pair=1, silent_share=0.0, refractory_us=0, leave_out_hot_pixels=False, train_num_rays_per_batch=1024
     )
-    return _trainer(method_name, datamanager, model, field_rate=5e-3, poses=FusedAdamConfig(lr=0.1))
+    return _trainer(
+        method_name,
+        datamanager,
+        model,
+        field_rate=5e-3,
+        field_decay=0.1,
+        averaged_steps=1,
+        poses=FusedAdamConfig(lr=0.1),
+    )
 
 
 ebarf = MethodSpecification(
@@ -83,6 +94,9 @@ ebarf = MethodSpecification(
         EventDataManagerConfig(),
         EbarfModelConfig(),
         field_rate=1e-2,
+        # Parameters that are averaged need not come to rest.
+        field_decay=0.3,
+        averaged_steps=100,
         poses=KeyframeAdamConfig(lr=0.03),
     ),
     description="NeRF from an event camera and its imperfect trajectory, which is refined on the way.",

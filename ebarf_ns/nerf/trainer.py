@@ -2,6 +2,8 @@
 
 import json
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from hashlib import sha256
@@ -19,6 +21,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -61,6 +64,7 @@ _LEAST = {
     "pipeline.model.camera_optimizer.keyframe_stride": 1,
     "pipeline.model.camera_optimizer.prior": 0,
     "pipeline.model.camera_optimizer.every": 1,
+    "averaged_steps": 1,
 }
 
 
@@ -150,6 +154,8 @@ class EbarfTrainerConfig(TrainerConfig):
     steps before; all schedules follow."""
     evaluations: int = 8
     """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
+    averaged_steps: int = 100
+    """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
 
 
 class EbarfTrainer(Trainer):
@@ -164,6 +170,7 @@ class EbarfTrainer(Trainer):
         self.train_seconds = 0.0
         self.event_pairs = 0
         self.steps_done = 0
+        self.mean: list[Tensor] | None = None
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
             for flag in ("max_num_iterations", "max_train_seconds"):
@@ -262,6 +269,7 @@ class EbarfTrainer(Trainer):
             self.save_checkpoint(step)
             raise TrainingError(f"{error}; --load-checkpoint {self._checkpoint_path()} does the last again") from None
         self.steps_done = step + 1
+        self._average()
         self.train_seconds = self._agreed(self.train_seconds + monotonic() - started)
         self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2 * self.world_size
         self.pipeline.record_cost(self.train_seconds, self.event_pairs)
@@ -271,6 +279,33 @@ class EbarfTrainer(Trainer):
         if after >= 1:
             self.stop_training = True
         return result
+
+    def _average(self) -> None:
+        """Let the mean of the parameters follow: over the last tenth of the steps, over ``averaged_steps`` at most."""
+        share = max(10 / (self.steps_done + 9), 1 / self.config.averaged_steps)
+        live = [parameter.detach() for parameter in self._parameters()]
+        if self.mean is None:
+            self.mean = [parameter.clone() for parameter in live]
+        for mean, parameter in zip(self.mean, live, strict=True):
+            mean.lerp_(parameter, share)
+
+    def _parameters(self) -> list[nn.Parameter]:
+        return [parameter for group in self.pipeline.get_param_groups().values() for parameter in group]
+
+    @contextmanager
+    def _averaged(self) -> Iterator[None]:
+        """The model with its mean parameters, which chance moves less than the last (Polyak and Juditsky, 1992)."""
+        live = [parameter.detach().clone() for parameter in self._parameters()]
+        try:
+            self._put(self.mean or live)
+            yield
+        finally:
+            self._put(live)
+
+    @torch.no_grad()
+    def _put(self, values: list[Tensor]) -> None:
+        for parameter, value in zip(self._parameters(), values, strict=True):
+            parameter.copy_(value)
 
     def _agreed(self, seconds: float) -> float:
         """The first process's clock: all processes must take schedules and end at the same step."""
@@ -283,7 +318,9 @@ class EbarfTrainer(Trainer):
     @check_main_thread
     def _evaluate(self, step: int, loss: float) -> None:
         final = self.progress() >= 1
-        results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
+        with self._averaged():
+            results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
+            write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
         record = {
             "step": self.steps_done,
             "train_seconds": round(self.train_seconds, 3),
@@ -294,7 +331,6 @@ class EbarfTrainer(Trainer):
             "peak_memory_mib": round(peak_memory_mib(self.device), 1),
         }
         self._record_metrics(record)
-        write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
         numbers = {name: value for name, value in results.items() if isinstance(value, float)}
         writer.put_dict(name="Evaluation", scalar_dict=numbers, step=step)
         shown = "  ".join(f"{name} {value:.4g}" for name, value in numbers.items())
@@ -359,10 +395,12 @@ class EbarfTrainer(Trainer):
                 "train_seconds": self.train_seconds,
                 "event_pairs": self.event_pairs,
                 "skipped_steps": self.optimizers.skipped,
+                # Those of the pipeline are the mean: what everybody but a resumed training is after.
+                "trained": [parameter.detach().clone() for parameter in self._parameters()],
             },
         }
         # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
-        with whole_file(self.base_dir / path.name) as temporary:
+        with whole_file(self.base_dir / path.name) as temporary, self._averaged():
             torch.save(state, temporary)
         (self.base_dir / path.name).replace(path)
         if self.config.save_only_latest_checkpoint:
@@ -393,6 +431,8 @@ class EbarfTrainer(Trainer):
             self.event_pairs = ours.get("event_pairs", 0)
             self.optimizers.skipped = ours.get("skipped_steps", 0)
             self.steps_done = self._start_step
+            self.mean = [parameter.detach().clone() for parameter in self._parameters()]
+            self._put(ours.get("trained", self.mean))
 
     def _loaded_path(self) -> Path | None:
         if self.config.load_dir is not None:
