@@ -19,9 +19,9 @@ def _trainer(
     datamanager: EventDataManagerConfig,
     model: EbarfModelConfig,
     field_rate: float,
-    field_decay: float,
-    averaged_steps: int,
     poses: OptimizerConfig,
+    field_decay: float = 0.1,
+    averaged_steps: int = 1,
 ) -> EbarfTrainerConfig:
     return EbarfTrainerConfig(
         method_name=method_name,
@@ -77,15 +77,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
     datamanager = EventDataManagerConfig(
         longest_pair=1, silent_share=0.0, refractory_us=0, leave_out_hot_pixels=False, train_num_rays_per_batch=1024
     )
-    return _trainer(
-        method_name,
-        datamanager,
-        model,
-        field_rate=5e-3,
-        field_decay=0.1,
-        averaged_steps=1,
-        poses=FusedAdamConfig(lr=0.1),
-    )
+    return _trainer(method_name, datamanager, model, field_rate=5e-3, poses=FusedAdamConfig(lr=0.1))
 
 
 ebarf = MethodSpecification(

@@ -282,6 +282,9 @@ class EbarfTrainer(Trainer):
 
     def _average(self) -> None:
         """Let the mean of the parameters follow: over the last tenth of the steps, over ``averaged_steps`` at most."""
+        if self.config.averaged_steps == 1:
+            self.mean = None
+            return
         share = max(10 / (self.steps_done + 9), 1 / self.config.averaged_steps)
         live = [parameter.detach() for parameter in self._parameters()]
         if self.mean is None:
