@@ -255,6 +255,11 @@ class EbarfTrainer(Trainer):
     def _write_report(self) -> None:
         write_report(self.base_dir, self.pipeline.scene.groundtruth)
 
+    @check_main_thread
+    def _train_complete_viewer(self) -> None:
+        with self._averaged():
+            super()._train_complete_viewer()
+
     def train_iteration(self, step: int) -> Any:
         """One step, its share of the budget, and the evaluation that may be due after it."""
         started = monotonic()

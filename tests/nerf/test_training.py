@@ -217,6 +217,22 @@ def test_a_checkpoint_holds_the_mean_of_the_last_steps_which_training_is_not_tol
         assert torch.allclose(mean[name], first[name].lerp(second[name], 10 / 11), atol=1e-7)
 
 
+def test_the_viewer_left_open_after_training_shows_what_was_saved(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from nerfstudio.engine.trainer import Trainer
+
+    shown: list[dict[str, torch.Tensor]] = []
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda training: shown.append(state(training)))
+    made = config(tiny_scene, tmp_path)
+    made.viewer.quit_on_train_completion = False
+    ready = trainer(made)
+    ready.train()
+    (path,) = ready.checkpoint_dir.iterdir()
+    kept = {name: value for name, value in torch.load(path, weights_only=True)["pipeline"].items() if name != "cost"}
+    assert same(shown[0], kept) and not same(shown[0], state(ready))
+
+
 def test_pairs_share_distances_and_jitter(tiny_scene: Path, tmp_path: Path):
     ready = trainer(config(tiny_scene, tmp_path))
     model = ready.pipeline.model.train()
