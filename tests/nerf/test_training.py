@@ -52,6 +52,13 @@ def state(ready: EbarfTrainer) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in ready.pipeline.state_dict().items() if name != "cost"}
 
 
+def saved(ready: EbarfTrainer) -> dict[str, torch.Tensor]:
+    """The same of its one checkpoint."""
+    (path,) = ready.checkpoint_dir.iterdir()
+    kept = torch.load(path, weights_only=True)["pipeline"]
+    return {name: value for name, value in kept.items() if name != "cost"}
+
+
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
@@ -203,11 +210,9 @@ def test_a_checkpoint_holds_the_mean_of_the_last_steps_which_training_is_not_tol
         made.averaged_steps = averaged_steps
         ready = trainer(made)
         ready.train()
-        (path,) = ready.checkpoint_dir.iterdir()
-        kept = torch.load(path, weights_only=True)["pipeline"]
         made.load_dir, made.max_num_iterations = ready.checkpoint_dir, steps + 1
         assert same(state(trainer(made)), state(ready))
-        return state(ready), {name: value for name, value in kept.items() if name != "cost"}
+        return state(ready), saved(ready)
 
     (first, _), (second, alone), (again, mean) = trained(1, 100), trained(2, 1), trained(2, 100)
     assert same(second, alone) and same(second, again)
@@ -228,9 +233,7 @@ def test_the_viewer_left_open_after_training_shows_what_was_saved(
     made.viewer.quit_on_train_completion = False
     ready = trainer(made)
     ready.train()
-    (path,) = ready.checkpoint_dir.iterdir()
-    kept = {name: value for name, value in torch.load(path, weights_only=True)["pipeline"].items() if name != "cost"}
-    assert same(shown[0], kept) and not same(shown[0], state(ready))
+    assert same(shown[0], saved(ready)) and not same(shown[0], state(ready))
 
 
 def test_pairs_share_distances_and_jitter(tiny_scene: Path, tmp_path: Path):
