@@ -10,8 +10,9 @@ from rich.table import Table
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
-from ebarf_ns.events.pairs import most_of_a_pixel
+from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.sensor_facts import Estimate, SensorFacts, identify_recording
 from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
@@ -50,6 +51,8 @@ class Summary:
     groundtruth: bool
     distortion: str
     """Camera model where it distorts, else none."""
+    sensor: SensorFacts
+    """What the recording tells of its sensor."""
     plan: list[Line]
     """What training will use on this machine unless flags say otherwise."""
     suspicions: list[str] = field(default_factory=list)
@@ -84,6 +87,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         within += len(chunk.between(first_us, last_us))
     events, start_us, end_us = file.span()
     busiest = int(counts.argmax())
+    facts = identify_recording(file, (first_us, last_us), scene.refractory_us)
     return Summary(
         events=events,
         width=camera.width,
@@ -95,7 +99,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         silent_pixel_share=float((counts == 0).mean()),
         events_per_active_pixel=float(counts[counts > 0].mean()),
         busiest_pixel=(busiest % camera.width, busiest // camera.width, int(counts[busiest])),
-        hot_pixels=int((counts > most_of_a_pixel(counts)).sum()),
+        hot_pixels=int(hot_pixels(counts, camera.width).sum()),
         keyframes=len(trajectory.t_us),
         trajectory_start_us=first_us,
         trajectory_end_us=last_us,
@@ -109,7 +113,8 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         frames=len(scene.frames),
         groundtruth=scene.groundtruth is not None,
         distortion=camera.model if camera.distortion else "none",
-        plan=plan_for(scene, smoothed(trajectory), events, "cuda" if torch.cuda.is_available() else "cpu"),
+        sensor=facts,
+        plan=plan_for(scene, smoothed(trajectory), events, "cuda" if torch.cuda.is_available() else "cpu", facts=facts),
     )
 
 
@@ -123,7 +128,7 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
             f"{summary.brighter_share:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?"
         )
     if summary.hot_pixels:
-        found.append(f"hot pixels, 10 times busier than usual and left out of training: {summary.hot_pixels:,}")
+        found.append(f"hot pixels, 3 times busier than their neighbours, left out of training: {summary.hot_pixels:,}")
     if summary.events_per_active_pixel < _FEW_EVENTS_PER_PIXEL:
         found.append(
             f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"
@@ -160,6 +165,10 @@ def print_summary(summary: Summary, folder: Path) -> None:
         console.print("[green]nothing suspicious[/green]")
 
 
+def _range(estimate: Estimate) -> str:
+    return f"{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g})"
+
+
 def _lines(summary: Summary) -> list[tuple[str, str]]:
     column, row, count = summary.busiest_pixel
     seconds = (summary.end_us - summary.start_us) * 1e-6
@@ -183,9 +192,15 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
         ("events within it", f"{summary.events_within_trajectory:,} ({within:.1%})"),
         (
             "thresholds",
-            f"on {threshold[0]}, off {threshold[1]}; their ratio is corrected in training"
+            f"stated: on {threshold[0]}, off {threshold[1]}; "
             if threshold
-            else "unknown: taken as equal, and their ratio is learned",
+            else "not stated; " + f"by events that must cancel, on / off is {_range(summary.sensor.threshold_ratio)}",
+        ),
+        ("blind time", f"{_range(summary.sensor.refractory_us)} us after an event, by the shortest intervals"),
+        (
+            "broken pixels",
+            f"{summary.hot_pixels:,} hot, {summary.sensor.dead_pixels:,} dead; "
+            f"{summary.sensor.blank_share:.1%} of the others never fire, as nothing passes them",
         ),
         (
             "distortion",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from ebarf_ns.events.sensor_facts import UNKNOWN_SENSOR, SensorFacts
 from ebarf_ns.geometry.so3 import rotate, turn_between
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate
 from ebarf_ns.radiance.field import fastest_precision
@@ -30,6 +31,7 @@ _GROWTH = 1.6
 _STRAIGHT_PX = 0.05
 _AS_GOOD_AS_STRAIGHT_PX = 0.02
 _UNEVEN = 4.0
+_MOST_BLANK = 0.06
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,12 @@ def plan_for(
     coarsest: int = 8,
     finest_given: int | None = None,
     normalized: bool = False,
+    facts: SensorFacts = UNKNOWN_SENSOR,
 ) -> list[Line]:
     """Decide for a scene, the trajectory that training begins from and a number of events, on "cpu" or "cuda".
 
     What is decided from the grid's coarsest and finest level follows those given, where they are; ``normalized`` is
-    the paper's Eq. 6.
+    the paper's Eq. 6; ``facts`` are those of the recording.
     """
     far_side = _far_side(scene, trajectory)
     bounded, distance = far_side is not None, far_side and far_side[0]
@@ -118,8 +121,40 @@ def plan_for(
             if normalized
             else "a silent pixel has changed by less than a threshold",
         ),
+        *_sensor_lines(scene, facts, normalized),
         Line(
             "pipeline.datamanager.train_num_rays_per_batch", rays, f"keeps {'a GPU' if rays > 1024 else 'caches'} full"
+        ),
+    ]
+
+
+def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Line]:
+    """What the sensor is taken to be: as the scene states it, else as the recording shows it."""
+    blind, ratio = facts.refractory_us, facts.threshold_ratio
+    if scene.refractory_us is not None:
+        refractory_us, blind_why = scene.refractory_us, "as scene.json states it"
+    else:
+        refractory_us = round(blind.value)
+        blind_why = (
+            f"found by the intervals at a pixel: {blind.low:.0f} to {blind.high:.0f} us"
+            if refractory_us
+            else f"intervals at a pixel, the shortest {blind.high:.0f} us, show no blind time"
+        )
+    stated = scene.contrast_threshold
+    if stated:
+        value, deviation, ratio_why = stated.on / stated.off, 0.0, "as scene.json states the thresholds"
+    else:
+        value, deviation = ratio.value, log(ratio.high / ratio.low) / 4
+        ratio_why = f"by events that must cancel: {ratio.low:.2f} to {ratio.high:.2f}"
+    blank = 0.0 if normalized else _MOST_BLANK * facts.blank_share
+    return [
+        Line("pipeline.datamanager.refractory_us", refractory_us, blind_why),
+        Line("pipeline.datamanager.blank_share", blank, f"{facts.blank_share:.0%} of the pixels never fire"),
+        Line("pipeline.model.threshold_ratio", value, ratio_why),
+        Line(
+            "pipeline.model.threshold_deviation",
+            deviation,
+            "how far training may refine the ratio" if deviation else "stated: nothing to refine",
         ),
     ]
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 FORMAT, VERSION = "ebarf-scene", 1
 # A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
 _LONGEST_SPAN_RATIO = 100
+_LONGEST_REFRACTORY_US = 1_000_000
+_KEYS = "format version events trajectory groundtruth frames camera contrast_threshold refractory_us bounds"
 FrameIntensity = Literal["linear", "srgb", "log"]
 
 
@@ -63,6 +65,8 @@ class Scene:
     groundtruth: Path | None = None
     frames: tuple[Frame, ...] = ()
     contrast_threshold: ContrastThreshold | None = None
+    refractory_us: int | None = None
+    """How long a pixel is blind after an event."""
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner in world units."""
 
@@ -73,7 +77,7 @@ def read_scene(folder: Path) -> Scene:
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder, expected a scene folder with scene.json in it")
     content = _Object(path, "", _read_json(path))
-    content.only("format version events trajectory groundtruth frames camera contrast_threshold bounds".split())
+    content.only(_KEYS.split())
     for key, expected in (("format", FORMAT), ("version", VERSION)):
         if content.get(key) != expected:
             raise SceneError(f"{path}: {key} is {content.get(key)!r}, expected {expected!r}")
@@ -90,6 +94,7 @@ def read_scene(folder: Path) -> Scene:
         contrast_threshold=_threshold(content.object("contrast_threshold"))
         if content.get("contrast_threshold") is not None
         else None,
+        refractory_us=_refractory_us(content) if content.get("refractory_us") is not None else None,
         bounds=_bounds(content) if content.get("bounds") is not None else None,
     )
 
@@ -144,6 +149,7 @@ def write_scene(scene: Scene) -> None:
         "frames": "frames.json" if scene.frames else None,
         "camera": _camera_json(scene.camera),
         "contrast_threshold": vars(scene.contrast_threshold) if scene.contrast_threshold else None,
+        "refractory_us": scene.refractory_us,
         "bounds": scene.bounds,
     }
     if scene.frames:
@@ -277,6 +283,13 @@ def _camera(content: _Object) -> Camera:
 def _threshold(content: _Object) -> ContrastThreshold:
     content.only(["on", "off"])
     return ContrastThreshold(content.number("on", positive=True), content.number("off", positive=True))
+
+
+def _refractory_us(content: _Object) -> int:
+    value = content.integer("refractory_us")
+    if not 0 <= value <= _LONGEST_REFRACTORY_US:
+        raise content.wrong("refractory_us", f"whole microseconds from 0 to {_LONGEST_REFRACTORY_US}")
+    return value
 
 
 def _bounds(content: _Object) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -14,6 +14,9 @@ from ebarf_ns.errors import EvaluationError
 from ebarf_ns.scene import Frame
 
 _DARKEST = 1e-3
+_BLACK = 5 / 255
+_HIGH_PASS_PX = (16, 4)
+_FLAT = 1e-12
 _SMALLEST_FOR_SSIM, _SMALLEST_FOR_LPIPS = 11, 64
 _FRAMES_TOO_SMALL = f"LPIPS left out: frames are smaller than {_SMALLEST_FOR_LPIPS} pixels"
 _WEIGHTS_CAME_LATER = "AlexNet's weights came after the evaluation: ns-eval has it now"
@@ -80,29 +83,58 @@ def depth_error(
 
 def fit_brightness(
     rendered_log: list[Float[np.ndarray, "height width"]], reference: list[Float[np.ndarray, "height width"]]
-) -> list[Float[np.ndarray, "height width"]]:
-    """Renders as linear radiance after one affine fit in log brightness over the whole set.
+) -> tuple[list[Float[np.ndarray, "height width"]], bool]:
+    """Renders as linear radiance after one affine fit in log brightness over the whole set; and whether it is inverted.
 
     Events leave gain and offset of log brightness open: log reference ~ a * rendered_log + b, least squares over the
-    pixels where the reference is neither black nor, at 1, as white as its format can say.
+    pixels where the reference is neither black nor, at 1, as white as its format can say. The gain is positive: a
+    render that is bright where the references are dark is inverted, and shown and judged as it is, with the references'
+    mean and contrast.
     """
     x = np.concatenate([image.ravel() for image in rendered_log])
     y = np.concatenate([image.ravel() for image in reference])
     bright = (y > _DARKEST) & (y != 1)
     if not bright.any() or np.ptp(x[bright]) == 0:
-        gain, offset = 0.0, float(np.log(np.maximum(y, _DARKEST)).mean())
-    else:
-        gain, offset = np.polyfit(x[bright], np.log(y[bright]), 1)
-    return [np.exp(gain * image + offset) for image in rendered_log]
+        return [np.full_like(image, np.log(np.maximum(y, _DARKEST)).mean()) for image in rendered_log], False
+    x, y = x[bright], np.log(y[bright])
+    gain, offset = np.polyfit(x, y, 1)
+    inverted = bool(gain < 0)
+    if inverted:
+        gain = y.std() / x.std()
+        offset = y.mean() - gain * x.mean()
+    return [np.exp(gain * image + offset) for image in rendered_log], inverted
+
+
+def log_correlation(
+    fitted: Float[np.ndarray, "height width"], reference: Float[np.ndarray, "height width"]
+) -> dict[str, float]:
+    """Correlation of the log brightness of a fitted render and a linear reference, whole and high-passed.
+
+    High-passed by taking away a Gaussian blur with a standard deviation of 16 and of 4 pixels: shading across the
+    picture, which events hardly tell, then counts for little or nothing. What is blacker than 5/255 of the reference's
+    format counts as that black. 0 where either picture is flat.
+    """
+    ours, theirs = (np.log(np.maximum(image, _BLACK)) for image in (fitted, reference))
+    found = {"log_correlation": _correlation(ours, theirs)}
+    for width_px in _HIGH_PASS_PX:
+        passed = (image - cv2.GaussianBlur(image, (0, 0), width_px) for image in (ours, theirs))
+        found[f"log_correlation_{width_px}px"] = _correlation(*passed)
+    return found
+
+
+def _correlation(ours: Float[np.ndarray, "height width"], theirs: Float[np.ndarray, "height width"]) -> float:
+    ours, theirs = ours - ours.mean(), theirs - theirs.mean()
+    scale = np.linalg.norm(ours) * np.linalg.norm(theirs)
+    return float((ours * theirs).sum() / scale) if scale > _FLAT * ours.size else 0.0
 
 
 def image_errors(
     rendered_log: list[Float[np.ndarray, "height width"]], reference: list[Float[np.ndarray, "height width"]]
 ) -> dict[str, float]:
-    """Mean PSNR, SSIM and LPIPS of log-brightness renders against linear references, on [0, 1] after the joint fit.
+    """Mean PSNR, SSIM, LPIPS and log correlation of log-brightness renders against linear references, after the fit.
 
-    LPIPS (Zhang et al. 2018, AlexNet) is not among them where :func:`lpips_missing` says why, nor SSIM where a frame is
-    smaller than its window.
+    The first three are on [0, 1]. LPIPS (Zhang et al. 2018, AlexNet) is not among them where :func:`lpips_missing` says
+    why, nor SSIM where a frame is smaller than its window. ``inverted`` is 1 where the render is, else 0.
     """
     from torchmetrics.functional.image import (
         learned_perceptual_image_patch_similarity,
@@ -111,20 +143,23 @@ def image_errors(
     )
 
     white = max(float(image.max()) for image in reference)
-    errors: dict[str, list[float]] = {"psnr": [], "ssim": [], "lpips": []}
+    errors: dict[str, list[float]] = {}
     with_lpips = lpips_missing(reference) is None
-    for fitted, truth in zip(fit_brightness(rendered_log, reference), reference, strict=True):
+    all_fitted, inverted = fit_brightness(rendered_log, reference)
+    for fitted, truth in zip(all_fitted, reference, strict=True):
         ours, theirs = (torch.from_numpy(np.clip(image / white, 0, 1))[None, None].float() for image in (fitted, truth))
-        errors["psnr"].append(float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)))
+        frame = {"psnr": float(peak_signal_noise_ratio(ours, theirs, data_range=1.0))}
         if min(truth.shape) >= _SMALLEST_FOR_SSIM:
             similarity = structural_similarity_index_measure(ours, theirs, data_range=1.0)
             assert isinstance(similarity, torch.Tensor)
-            errors["ssim"].append(float(similarity))
+            frame["ssim"] = float(similarity)
         if with_lpips:
             ours, theirs = (image.expand(-1, 3, -1, -1) for image in (ours, theirs))
             distance = learned_perceptual_image_patch_similarity(ours, theirs, net_type="alex", normalize=True)
-            errors["lpips"].append(float(distance))
-    return {name: float(np.mean(values)) for name, values in errors.items() if values}
+            frame["lpips"] = float(distance)
+        for name, value in {**frame, **log_correlation(fitted, truth)}.items():
+            errors.setdefault(name, []).append(value)
+    return {name: float(np.mean(values)) for name, values in errors.items()} | {"inverted": float(inverted)}
 
 
 def lpips_note(evaluation: dict[str, Any]) -> str | None:

@@ -23,19 +23,24 @@ def prediction(
     polarity_sum: Float[np.ndarray, "pairs"],
     event_count: Float[np.ndarray, "pairs"],
     variance: Float[np.ndarray, "pairs"],
+    threshold_ratio: float,
 ) -> Prediction:
-    """min over on, off >= 0 of sum w (c - r)² / sum w c², w = 1 / variance, r = on * brighter - off * darker events.
+    """min over C >= 0 of sum w (c - C r)² / sum w c², w = 1 / variance, r = sqrt(q) brighter - darker / sqrt(q) events.
 
-    Both thresholds are fitted, since events leave their scale open and nominal ones are seldom those in force, so that
-    the number compares methods and sensors. c are the rendered changes of log brightness.
+    c are the rendered changes of log brightness and q is ``threshold_ratio``, C_on / C_off as the recording has it.
+    Only the thresholds' scale is fitted, as events leave it open. Were their ratio fitted too, a render that brightens
+    all along the camera's way would explain what it has itself made up. The thresholds returned are both fitted, to be
+    looked at.
     """
     if not polarity_sum.any():
         return Prediction(float("nan"), None, None)
     weight = 1 / np.sqrt(variance)
     brighter = (event_count + polarity_sum) / 2
     counts = np.stack([brighter, brighter - event_count], axis=1) * weight[:, None]
-    (on, off), left = nnls(counts, change * weight)
-    apart = np.linalg.matrix_rank(counts, tol=1e-6 * np.linalg.norm(counts)) == 2
+    seen, told = change * weight, counts @ np.array([threshold_ratio**0.5, threshold_ratio**-0.5])
+    scale = max(float(seen @ told), 0.0) / max(float(told @ told), 1e-300)
     # A render that shows no change, or moves against the events, explains nothing of them.
-    unexplained = float(left / np.linalg.norm(change * weight)) ** 2 if on or off else 1.0
+    unexplained = float(np.linalg.norm(seen - scale * told) / np.linalg.norm(seen)) ** 2 if scale else 1.0
+    (on, off), _ = nnls(counts, seen)
+    apart = np.linalg.matrix_rank(counts, tol=1e-6 * np.linalg.norm(counts)) == 2
     return Prediction(unexplained, *((float(on), float(off)) if apart else (None, None)))

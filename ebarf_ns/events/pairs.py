@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.pixels import dead_pixels, hot_pixels
 from ebarf_ns.events.recording import Recording
 
 if TYPE_CHECKING:
@@ -28,9 +29,8 @@ if TYPE_CHECKING:
 _EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
-_ENOUGH_INTERVALS, _INTERVALS = 20_000, 200_000
-_MOST_OVER_USUAL, _ALWAYS_COUNT = 10, 200
 _MOST_MISSED = 3.0
+_BLANK_REACH, _VARIANCE_OF_BLANK = 0.1, 30.0
 _VARIANCE_OF_MISSED = 8.0
 """Of a missed event, over that of one with a threshold of usual spread (5 %): 0.3 against 0.035 squared thresholds."""
 
@@ -39,11 +39,14 @@ _VARIANCE_OF_MISSED = 8.0
 class EventPairs:
     """Pairs of times at a pixel: both, the sum of polarities in (t0, t1] and the number of events in it.
 
-    An event begins each pair, and another one ends it, or else a time at which the pixel is silent.
+    An event begins each pair, and another one ends it, or else a time at which the pixel is silent. Pairs of blank
+    pixels lie at one time and two pixels.
     """
 
     pixel: Int64[np.ndarray, "pairs"]
     """Row-major index y * width + x."""
+    pixel_before: Int64[np.ndarray, "pairs"]
+    """Where a pair begins: at the same pixel but for pairs of blank pixels."""
     t0_us: Int64[np.ndarray, "pairs"]
     t1_us: Int64[np.ndarray, "pairs"]
     polarity_sum: Float[np.ndarray, "pairs"]
@@ -83,6 +86,13 @@ class PairIndex:
     """Pixels, those with the most events first but for the hot ones, which come last and count for nothing."""
     events_before: Int64[np.ndarray, "pixels+1"]
     """Number of events of all the pixels before each place of ``busiest``."""
+    responsive: Int64[np.ndarray, "responsive"]
+    """Pixels whose silence means something: neither hot nor dead."""
+
+    @cached_property
+    def blank(self) -> Int64[np.ndarray, "blank"]:
+        """Responsive pixels that never fire."""
+        return self.responsive[np.diff(self.first)[self.responsive] == 0]
 
     @property
     def max_steps(self) -> int:
@@ -115,22 +125,9 @@ class PairIndex:
 
     def with_hot_pixels(self) -> PairIndex:
         """The same events, those of hot pixels counting like all others."""
-        return _counting(self.events, self.first, np.diff(self.first))
-
-    @cached_property
-    def refractory_us(self) -> int:
-        """How long pixels are blind after an event, as the times between their events tell; 0 where they do not.
-
-        Behind such a time intervals pile up: the 60th shortest of up to 200,000 is less than a quarter longer than the
-        20th, and half of all are longer than twice that. The blind time is then as much shorter than the 20th as that
-        is than the 60th.
-        """
-        intervals = min(int(self.count(np.array(1))), _INTERVALS)
-        if intervals < _ENOUGH_INTERVALS:
-            return 0
-        pairs = self.draw(np.ones(_INTERVALS, np.int64), np.random.default_rng(0))
-        shortest, short, usual = np.quantile(pairs.duration_us, [20 / intervals, 60 / intervals, 0.5])
-        return int(2 * shortest - short) if short < 1.25 * shortest and 2 * shortest < usual else 0
+        counts = np.diff(self.first)
+        hot = np.setdiff1d(np.nonzero(counts)[0], self.responsive)
+        return _counting(self.events, self.first, counts, np.union1d(self.responsive, hot))
 
     def draw(
         self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator, refractory_us: int = 0
@@ -144,20 +141,40 @@ class PairIndex:
         pixels, pairs = self._count(steps)
         order = (self.events_before, self.busiest, self.first, self.events)
         pixel, *times_and_sums = _look_up(random.integers(pairs), steps, pixels, *order, refractory_us)
-        return EventPairs(pixel, *times_and_sums, silent=np.zeros(len(pixel), bool))
+        return EventPairs(pixel, pixel, *times_and_sums, silent=np.zeros(len(pixel), bool))
 
     def draw_silent(
         self, count: int, longest: int, span_us: tuple[int, int], random: np.random.Generator, refractory_us: int = 0
     ) -> EventPairs:
         """Pairs that end at any time within the span, and begin with an event, 0 to ``longest`` of them before.
 
-        Uniform over time and the pixels that have events; fewer than ``count``, as some ends lie before the first.
+        Uniform over time and the ``responsive`` pixels. While a pixel has not fired yet, or where it never does, a pair
+        begins at any time before.
         """
-        pixel = self.busiest[random.integers(self._counting_pixels, size=count)]
+        pixel = self.responsive[random.integers(len(self.responsive), size=count)]
         t1_us = random.integers(span_us[0], span_us[1], size=count, endpoint=True)
+        before_us = random.integers(span_us[0], t1_us, endpoint=True)
         steps = draw_steps(count, longest + 1, random) - 1
-        known, *times_and_sums = _look_back(pixel, t1_us, steps, self.first, self.events, refractory_us)
-        return EventPairs(pixel, *times_and_sums, silent=np.ones(count, bool)).select(known)
+        columns = _look_back(pixel, t1_us, before_us, steps, self.first, self.events, refractory_us)
+        return EventPairs(pixel, pixel, *columns, silent=np.ones(count, bool))
+
+    def draw_blank(self, count: int, width: int, span_us: tuple[int, int], random: np.random.Generator) -> EventPairs:
+        """Pairs of ``blank`` pixels at one time, a tenth of the sensor's width apart (standard deviation).
+
+        What no pixel has ever fired at is taken as one surface of one brightness, loosely: the variance is that of 30
+        events. Fewer than ``count``, as many have a pixel that fires at their other end.
+        """
+        is_blank = np.zeros(len(self.first) - 1, bool)
+        is_blank[self.blank] = True
+        pixel = self.blank[random.integers(len(self.blank), size=count)]
+        away = np.rint(random.normal(0, _BLANK_REACH * width, (2, count))).astype(np.int64)
+        x, y = pixel % width + away[0], pixel // width + away[1]
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y * width + x < len(is_blank))
+        other = np.where(inside, y * width + x, pixel)
+        t_us, zeros = random.integers(*span_us, size=count, endpoint=True), np.zeros(count)
+        variance, silent = np.full(count, _VARIANCE_OF_BLANK), zeros.astype(bool)
+        pairs = EventPairs(pixel, other, t_us, t_us, zeros, zeros, variance, silent)
+        return pairs.select(inside & is_blank[other])
 
     def draw_accepted(
         self,
@@ -210,9 +227,10 @@ def _look_up(number, steps, pixels, events_before, busiest, first, events, refra
 
 
 @njit(cache=True, nogil=True)
-def _look_back(pixel, t1_us, steps, first, events, refractory_us):
-    """Whether there is an event before each time, and what :class:`EventPairs` holds of the pair that ends then."""
-    known, t0_us = np.zeros(len(pixel), np.bool_), t1_us.copy()
+def _look_back(pixel, t1_us, before_us, steps, first, events, refractory_us):
+    """What :class:`EventPairs` holds of the pair that ends at each time; it begins at ``before_us`` where there is no
+    event before."""
+    t0_us = before_us.copy()
     total, count, variance = np.zeros(len(pixel)), np.zeros(len(pixel)), np.zeros(len(pixel))
     for i in range(len(pixel)):
         begin, low = first[pixel[i]], first[pixel[i]]
@@ -226,13 +244,12 @@ def _look_back(pixel, t1_us, steps, first, events, refractory_us):
         last = low - 1
         if last < begin:
             continue
-        known[i] = True
         before = max(last - steps[i], begin)
         t0_us[i] = min(events[before].t_us + refractory_us, t1_us[i])
         # What the pixel missed after its last event is known by the next one, where there is one.
         after = min(low, end - 1)
         total[i], count[i], variance[i] = _told(events, first, pixel[i], before, last, after, refractory_us)
-    return known, t0_us, t1_us, total, count, variance
+    return t0_us, t1_us, total, count, variance
 
 
 @njit(cache=True, inline="always")
@@ -244,14 +261,14 @@ def _told(events, first, pixel, before, last, after, refractory_us):
     count = np.float64(steps)
     if refractory_us > 0:
         for k in range(before + 1, after):
-            missed = _missed(events, k, first[pixel], refractory_us)
+            missed = missed_after(events, k, first[pixel], refractory_us)
             total += missed
             count += abs(missed)
     return total, count, steps + _VARIANCE_OF_MISSED * (count - steps)
 
 
 @njit(cache=True, inline="always")
-def _missed(events, k, first, refractory_us):
+def missed_after(events, k, first, refractory_us):
     """Events missed right after event ``k``, with its sign: at the rate of the faster one next to it that has its sign.
 
     At most three: what changes faster has changed when the pixel sees again. (The mean of both rates, or what gaps
@@ -297,23 +314,14 @@ def index_pairs(
         for chunk in chunks():
             _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
         begin = end
-    return _counting(events, first, np.where(counts > most_of_a_pixel(counts), 0, counts))
+    hot = hot_pixels(counts, width)
+    responsive = np.nonzero(~hot & ~dead_pixels(counts, width))[0]
+    return _counting(events, first, np.where(hot, 0, counts), responsive)
 
 
-def _counting(events: np.ndarray, first: np.ndarray, counted: np.ndarray) -> PairIndex:
+def _counting(events: np.ndarray, first: np.ndarray, counted: np.ndarray, responsive: np.ndarray) -> PairIndex:
     busiest = np.argsort(-counted, kind="stable")
-    return PairIndex(events, first, busiest, np.r_[0, counted[busiest].cumsum()])
-
-
-def most_of_a_pixel(counts: Int64[np.ndarray, "pixels"]) -> int:
-    """Events beyond which a pixel is hot: 10 times what the pixel of a usual event has."""
-    falling = np.sort(counts)[::-1]
-    # Hot pixels are few, and do not say what is usual.
-    others = falling[len(falling) // 1000 + 1 :]
-    if not others.any():
-        return int(falling[0])
-    usual = others[np.searchsorted(others.cumsum(), others.sum() / 2)]
-    return max(_MOST_OVER_USUAL * int(usual), _ALWAYS_COUNT)
+    return PairIndex(events, first, busiest, np.r_[0, counted[busiest].cumsum()], responsive)
 
 
 def _file_backed(count: int) -> np.ndarray:

@@ -28,6 +28,7 @@ from ebarf_ns.events.pairs import (
     joined,
 )
 from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.sensor_facts import SensorFacts, identify
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
 from ebarf_ns.scene import Scene, check_clocks
@@ -85,10 +86,12 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
     silent_share: float | None = None
     """Share of a batch's pairs that end while the pixel is silent, not with an event; None: as planned."""
+    blank_share: float | None = None
+    """Share of a batch's pairs that join two pixels which never fire, as parts of one surface; None: as planned."""
     refractory_us: int | None = None
-    """How long a pixel is blind after an event; None: as the recording shows it, 0: not at all."""
+    """How long a pixel is blind after an event, 0: not at all; None: as the scene states it, else as found."""
     leave_out_hot_pixels: bool = True
-    """Train without the pixels that have 10 times the events of usual ones."""
+    """Train without the pixels that are far busier than those around them."""
     heldout_share: float = 0.05
     """Share of the recording's time whose events are kept for heldout_event_loss."""
     index_memory_gib: float = 4.0
@@ -113,7 +116,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
             CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
             if self.hot_pixels_left_out:
-                CONSOLE.print(f"left out {self.hot_pixels_left_out:,} hot pixels, 10 times busier than usual")
+                CONSOLE.print(f"left out {self.hot_pixels_left_out:,} hot pixels, 3 times busier than their neighbours")
             if self.refractory_us:
                 CONSOLE.print(f"pixels are blind for {self.refractory_us:,} us after an event")
 
@@ -168,21 +171,27 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return HeldoutBlocks(*self.span_us, self.config.heldout_share)
 
     @cached_property
+    def facts(self) -> SensorFacts:
+        """What the recording tells of its sensor, whatever flags say: what methods are compared by."""
+        return identify(self.index, self.train_dataset.scene.refractory_us)
+
+    @property
     def refractory_us(self) -> int:
         """How long pixels are taken to be blind after an event."""
-        return self.index.refractory_us if self.config.refractory_us is None else self.config.refractory_us
+        return self.config.refractory_us or 0
 
     @cached_property
     def _training_batches(self) -> DrawAhead:
         # Before there are threads: each of them would make one of its own.
-        _ = self._training_index, self.refractory_us
+        _ = self._training_index
         ahead = 1 if torch.device(self.device).type == "cpu" else 4
         return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
 
     def _draw_training_pairs(self, batch: int) -> EventPairs:
         total = self.get_train_rays_per_batch() // 2
         silent = min(int(total * (self.config.silent_share or 0.0)), total - 1)
-        count = total - silent
+        blank = min(int(total * (self.config.blank_share or 0.0)), total - 1 - silent)
+        count = total - silent - blank
         random = batch_random(self.config.seed, batch)
         pairs = self._training_index.draw_accepted(
             count, self.config.longest_pair, random, self._heldout_blocks.training, self.refractory_us
@@ -198,14 +207,24 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         drawn = self._training_index.draw_silent(
             2 * silent, self.config.longest_pair, self.span_us, random, self.refractory_us
         )
-        return joined([pairs, drawn.select(self._heldout_blocks.training(drawn)).select(slice(silent))])
+        parts = [pairs, drawn.select(self._heldout_blocks.training(drawn)).select(slice(silent))]
+        if blank:
+            # Most of them join a blank pixel with one that fires.
+            width = self._recording.width
+            parts.append(self._training_index.draw_blank(4 * blank, width, self.span_us, random).select(slice(blank)))
+        return joined(parts)
+
+    @property
+    def _believed_refractory_us(self) -> float:
+        stated = self.train_dataset.scene.refractory_us
+        return self.facts.refractory_us.value if stated is None else stated
 
     @cached_property
     def heldout_pairs(self) -> EventPairs:
         """Pairs that no training sees, the same for every method and seed."""
         count = self.config.eval_num_rays_per_batch // 2
         random = batch_random(_HELDOUT_SEED, 0)
-        accepted, refractory_us = self._heldout_blocks.heldout, self.index.refractory_us
+        accepted, refractory_us = self._heldout_blocks.heldout, round(self._believed_refractory_us)
         return self.index.draw_accepted(count, _LONGEST_HELDOUT_PAIR, random, accepted, refractory_us)
 
     @cached_property
@@ -240,7 +259,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         def tensor(column: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(column).to(self.device)
 
-        directions = self.bearings[tensor(pairs.pixel)].repeat(2, 1)
+        directions = self.bearings[torch.cat([tensor(pairs.pixel_before), tensor(pairs.pixel)])]
         bundle = RayBundle(
             origins=torch.zeros_like(directions),
             directions=directions,

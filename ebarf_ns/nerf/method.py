@@ -60,7 +60,8 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         loss="normalized",
         outliers_from=None,
         render_variance=0.0,
-        learn_sensor=False,
+        threshold_ratio=1.0,
+        threshold_deviation=0.0,
         brightness="lin_log",
         intensity_range="unit",
         view_dependent=True,
@@ -75,7 +76,12 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         precision="float32",
     )
     datamanager = EventDataManagerConfig(
-        longest_pair=1, silent_share=0.0, refractory_us=0, leave_out_hot_pixels=False, train_num_rays_per_batch=1024
+        longest_pair=1,
+        silent_share=0.0,
+        blank_share=0.0,
+        refractory_us=0,
+        leave_out_hot_pixels=False,
+        train_num_rays_per_batch=1024,
     )
     return _trainer(method_name, datamanager, model, field_rate=5e-3, poses=FusedAdamConfig(lr=0.1))
 

@@ -1,6 +1,7 @@
 """The picture of the method: event pair, two poses, two rays, two intensities, one difference, one loss."""
 
 from dataclasses import dataclass, field
+from math import sqrt
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -16,15 +17,15 @@ from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
-from ebarf_ns.photometry.sensor_response import SensorResponse
+from ebarf_ns.photometry.sensor_response import SensorResponse, thresholds_of_ratio
 from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
 from ebarf_ns.radiance.hash_grid import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
-from ebarf_ns.scene import ContrastThreshold, Scene
+from ebarf_ns.scene import Scene
 
 # Log brightness is known up to a factor, which the field can follow: 0.1 or 0.6 in place of 0.25 cost 1 to 2 dB.
-_UNKNOWN_THRESHOLDS = ContrastThreshold(0.25, 0.25)
+_UNKNOWN_THRESHOLD = 0.25
 T = TypeVar("T")
 
 
@@ -53,8 +54,13 @@ class EbarfModelConfig(ModelConfig):
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     render_variance: float = 5.0
     """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
-    learn_sensor: bool = True
-    """With Eq. 5: learn the ratio of the contrast thresholds, or take them as given."""
+    threshold_ratio: float | None = None
+    """With Eq. 5: C_on / C_off; None: as the scene states it, else as counted in the recording."""
+    threshold_deviation: float | None = None
+    """With Eq. 5: relative deviation of that ratio, within which training refines it; 0: it stands; None: 0 where the
+    ratio is stated, else as counted."""
+    threshold_prior: float = 0.01
+    """What a ratio one deviation off costs, where a render wrong by a threshold costs 1."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -104,9 +110,16 @@ class EbarfModel(Model):
         assert isinstance(scene, Scene)
         self.normalized = config.loss == "normalized"
         # The paper's Eq. 6 takes polarities as they are, and knows no scale that a ratio could be learned in.
-        given = scene.contrast_threshold or _UNKNOWN_THRESHOLDS
-        on, off = (1.0, 1.0) if self.normalized else (given.on, given.off)
-        self.sensor = SensorResponse(on, off, config.learn_sensor and not self.normalized)
+        given = scene.contrast_threshold
+        ratio, deviation = _planned(config.threshold_ratio), _planned(config.threshold_deviation)
+        if self.normalized:
+            on, off = 1.0, 1.0
+        elif given and given.on / given.off == ratio:
+            on, off = given.on, given.off
+        else:
+            mean = sqrt(given.on * given.off) if given else _UNKNOWN_THRESHOLD
+            on, off = thresholds_of_ratio(ratio, mean)
+        self.sensor = SensorResponse(on, off, 0.0 if self.normalized else deviation)
         self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
             levels=_planned(config.grid_levels),
@@ -196,6 +209,8 @@ class EbarfModel(Model):
                 self.config.render_variance,
             )
         losses = {"event_loss": loss}
+        if self.sensor.learned:
+            losses["threshold_prior"] = self.config.threshold_prior * self.sensor.prior()
         self.camera_optimizer.get_loss_dict(losses)
         return losses
 

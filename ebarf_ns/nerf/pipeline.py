@@ -107,12 +107,18 @@ class EbarfPipeline(VanillaPipeline):
         rays, batch = self.datamanager.next_eval(0)
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)
         columns = (batch[name].double().cpu().numpy() for name in ("polarity_sum", "event_count", "variance"))
-        predicted = prediction((after - before).numpy(), *columns)
+        predicted = prediction((after - before).numpy(), *columns, self._threshold_ratio)
         return {
             "heldout_event_loss": predicted.unexplained,
             "implied_threshold_on": predicted.threshold_on,
             "implied_threshold_off": predicted.threshold_off,
         }
+
+    @property
+    def _threshold_ratio(self) -> float:
+        """C_on / C_off as stated, or as counted in the recording: the same for every method and setting."""
+        stated = self.scene.contrast_threshold
+        return stated.on / stated.off if stated else self.datamanager.facts.threshold_ratio.value
 
     def _image_errors(self, renders: Path | None, scale_to_reference: float | None) -> dict[str, float | None]:
         """Frames at the refined pose of their time, and apart from them those outside the trajectory's span."""
@@ -164,7 +170,8 @@ class EbarfPipeline(VanillaPipeline):
         references = [read_frame(frame) for frame in frames]
         if renders:
             white = max(float(image.max()) for image in references)
-            pairs = zip(fit_brightness(rendered, references), references, strict=True)
+            fitted_renders, _ = fit_brightness(rendered, references)
+            pairs = zip(fitted_renders, references, strict=True)
             for k, (fitted, reference) in enumerate(pairs):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
                 with whole_file(renders / f"{k:04d}.png") as temporary:

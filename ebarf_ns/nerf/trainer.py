@@ -28,6 +28,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from ebarf_ns.errors import TrainingError, one_line_errors
 from ebarf_ns.evaluation.report import write_report
 from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
@@ -45,6 +46,10 @@ _LEAST = {
     "pipeline.datamanager.longest_pair": 1,
     "pipeline.datamanager.silent_share": 0,
     "pipeline.datamanager.refractory_us": 0,
+    "pipeline.datamanager.blank_share": 0,
+    "pipeline.model.threshold_ratio": 1e-3,
+    "pipeline.model.threshold_deviation": 0,
+    "pipeline.model.threshold_prior": 0,
     "pipeline.datamanager.heldout_share": 0,
     "pipeline.datamanager.index_memory_gib": 1e-6,
     "pipeline.model.grid_levels": 1,
@@ -206,12 +211,15 @@ class EbarfTrainer(Trainer):
         scene = read_scene(Path(folder))
         trajectory = read_tum(scene.trajectory)
         check_bounds(scene, trajectory)
-        events, _, _ = RecordingFile(scene.events, scene.camera.width, scene.camera.height).span()
+        file = RecordingFile(scene.events, scene.camera.width, scene.camera.height)
+        events, _, _ = file.span()
+        refractory_us = scene.refractory_us if datamanager.refractory_us is None else datamanager.refractory_us  # pyright: ignore[reportAttributeAccessIssue]
+        facts = identify_recording(file, (int(trajectory.t_us[0]), int(trajectory.t_us[-1])), refractory_us)
         device = "cuda" if self.device.startswith("cuda") else "cpu"
         model: Any = self.config.pipeline.model
         start = model.camera_optimizer.start(trajectory)
         normalized = model.loss == "normalized"
-        lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized)
+        lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized, facts)
         self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
         self._keep_plan()
 

@@ -10,6 +10,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+_SILENT_SHARE = 0.5
+
 
 def reported_change(
     polarity_sum: Float[Tensor, "pairs"],
@@ -38,10 +40,11 @@ def nearest_allowed(
     """The change that events allow and that is nearest to the rendered one, as a target: no gradient to ``change``.
 
     A pair that ends with an event changed by what was reported. While its pixel is ``silent`` since, it rose by less
-    than C_on beyond that, and fell by less than C_off (the no-event loss of E-NeRF, Klenk et al. 2023).
+    than C_on beyond that, and fell by less than C_off (the no-event loss of E-NeRF, Klenk et al. 2023). Most likely it
+    did not change at all: within those limits an error counts by half, lest fog gather where nothing is reported.
     """
     most, least = (torch.as_tensor(threshold).detach().to(change) for threshold in (threshold_on, threshold_off))
-    return reported + silent * (change - reported).detach().clamp(-least, most)
+    return reported + _SILENT_SHARE * silent * (change - reported).detach().clamp(-least, most)
 
 
 def threshold_loss(

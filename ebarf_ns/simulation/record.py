@@ -60,7 +60,7 @@ class _Steps:
 
     def __init__(self, view: View, model: SensorModel, end_us: int):
         self._view, self._end_us = view, float(end_us)
-        self._longest_us = 1e6 / (2 * np.pi * model.cutoff_hz) / _STEPS_PER_LAG if model.cutoff_hz else _LONGEST_US
+        self._longest_us = 1e6 / (2 * np.pi * model.widest_hz) / _STEPS_PER_LAG if model.cutoff_hz else _LONGEST_US
         rays = view.camera.width * view.camera.height * view.rays_per_pixel
         self._at_once = int(np.clip(_RAYS_AT_ONCE // rays, 1, _MOST_AT_ONCE))
         # Over so few steps things come no nearer than this share of their distance.

@@ -1,6 +1,7 @@
 """The event sensor: log brightness in, threshold crossings out (Eq. 1), as cleanly or as badly as asked for.
 
-The imperfections are those that v2e (Hu, Liu, Delbruck 2021) describes.
+The imperfections are those that v2e (Hu, Liu, Delbruck 2021) describes. Deblur e-NeRF (Low & Lee 2024) models the
+bandwidth that follows the light in more detail.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 from numba import njit
+
+_NARROWEST, _WIDEST = 0.1, 3.0
+"""Bounds of a bandwidth that follows the light, over ``cutoff_hz``."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,9 @@ class SensorModel:
     """After an event, a pixel is blind this long, and then compares with what it sees at the end of it."""
     cutoff_hz: float = 0.0
     """Bandwidth of the pixels, a low pass of first order on log brightness; 0: unlimited."""
+    cutoff_reference: float = 0.0
+    """Linear intensity at which the bandwidth is ``cutoff_hz``; it then follows the light, cutoff_hz * clip(intensity /
+    cutoff_reference, 0.1, 3); 0: the same at any light."""
     shot_noise_hz: float = 0.0
     """Events of either polarity out of nothing, a pixel."""
     leak_hz: float = 0.0
@@ -35,6 +42,11 @@ class SensorModel:
     """Events of either polarity out of nothing of each hot pixel."""
     jitter_us: float = 0.0
     """Standard deviation of the timestamps."""
+
+    @property
+    def widest_hz(self) -> float:
+        """Bandwidth of the fastest pixels; 0: unlimited."""
+        return self.cutoff_hz * (_WIDEST if self.cutoff_reference else 1)
 
 
 class Crossings(NamedTuple):
@@ -53,13 +65,15 @@ class Crossings(NamedTuple):
 class EventSensor:
     """Compares each pixel's log brightness with ``level``, that at its last event.
 
-    Between two samples of a pixel its log brightness is taken as linear in time.
+    Between two samples of a pixel its log brightness is taken as linear in time, and its bandwidth as that of the light
+    halfway.
     """
 
     def __init__(self, model: SensorModel, end_us: float, seed: int, log_brightness: Float[np.ndarray, "pixels"]):
         """Begin at time 0 with the log brightness of all pixels."""
         self.model, self.end_us = model, end_us
         self._random = np.random.default_rng([seed, 41])
+        self._leak_per_us = model.threshold_on * model.leak_hz * 1e-6
         count = len(log_brightness)
         mismatch = np.maximum(1 + model.threshold_mismatch * self._random.standard_normal((2, count)), 0.1)
         self.threshold_on, self.threshold_off = model.threshold_on * mismatch[0], model.threshold_off * mismatch[1]
@@ -76,7 +90,7 @@ class EventSensor:
 
     def leak(self, t_us: Float[np.ndarray, "samples"]) -> Float[np.ndarray, "samples"]:
         """What leaks into the comparison by a time, in log brightness."""
-        return self.model.threshold_on * self.model.leak_hz * 1e-6 * t_us
+        return self._leak_per_us * t_us
 
     def see(
         self,
@@ -92,7 +106,8 @@ class EventSensor:
             pixel, t_us, log_brightness + self.leak(t_us),
             self._t_us, self._input, self._output, self.level, self._blind_until_us,
             self.threshold_on * growth, self.threshold_off * growth,
-            2e-6 * np.pi * self.model.cutoff_hz, float(self.model.refractory_us),
+            2e-6 * np.pi * self.model.cutoff_hz, float(self.model.cutoff_reference), self._leak_per_us,
+            float(self.model.refractory_us),
             noise_pixel, noise_us, noise_polarity,
         )  # fmt: skip
         return Crossings(*columns)
@@ -117,7 +132,7 @@ class EventSensor:
 @njit(cache=True)
 def _observe(
     pixels, times_us, inputs, last_us, last_input, last_output, level, blind_until_us, threshold_on, threshold_off,
-    cutoff_rad_us, refractory_us, noise_pixel, noise_us, noise_polarity,
+    cutoff_rad_us, cutoff_reference, leak_per_us, refractory_us, noise_pixel, noise_us, noise_polarity,
 ):  # fmt: skip
     """Go through the samples of each pixel; the arrays with a value for each pixel are brought up to date."""
     capacity = 1024
@@ -130,9 +145,14 @@ def _observe(
             continue
         before, after = last_output[p], inputs[i]
         if cutoff_rad_us > 0:
+            rad_us = cutoff_rad_us
+            if cutoff_reference > 0:
+                # The inputs leak, the light does not.
+                light = np.exp((last_input[p] + inputs[i] - leak_per_us * (before_us + after_us)) / 2)
+                rad_us *= min(max(light / cutoff_reference, _NARROWEST), _WIDEST)
             # Exact for an input that is linear between samples.
-            lag = (inputs[i] - last_input[p]) / (after_us - before_us) / cutoff_rad_us
-            fade = np.exp(-cutoff_rad_us * (after_us - before_us))
+            lag = (inputs[i] - last_input[p]) / (after_us - before_us) / rad_us
+            fade = np.exp(-rad_us * (after_us - before_us))
             after = inputs[i] - lag + (before - last_input[p] + lag) * fade
         slope = (after - before) / (after_us - before_us)
         while noise < len(noise_pixel) and noise_pixel[noise] < p:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import expi
 
 from ebarf_ns.simulation.sensor import Crossings, EventSensor, SensorModel
 
@@ -102,6 +103,63 @@ def test_limited_bandwidth_answers_a_step_as_a_low_pass_does():
     lag_us = 1e6 / (2 * np.pi * 100)
     events = watch(curve, t_us, model)
     assert np.allclose(events.t_us[: len(expected)], -lag_us * np.log(1 - np.array(expected) / 2), atol=5)
+
+
+def lagging_events_us(intensity: float, model: SensorModel, step_us: float = 20.0) -> np.ndarray:
+    """Events of a pixel whose log brightness rises by 2 within a microsecond, to this intensity."""
+    t_us = np.r_[0.0, 1.0, np.arange(step_us, 150_001, step_us)]
+    return watch(np.where(t_us > 0, 0.0, -2.0)[:, None] + np.log(intensity), t_us, model).t_us
+
+
+FOLLOWS_LIGHT = replace(CLEAN, cutoff_hz=100.0, cutoff_reference=0.5)
+
+
+@pytest.mark.parametrize("intensity", [0.25, 1.0])
+def test_bandwidth_that_follows_the_light_answers_a_step_as_a_low_pass_does(intensity: float):
+    # The first level lies somewhere within a threshold of the start.
+    level = EventSensor(FOLLOWS_LIGHT, 1.0, 0, np.zeros(1)).level[0]
+    expected = np.array([level + 0.2 * k for k in range(1, 20) if 0 < level + 0.2 * k < 2])
+    lag_us = 1e6 / (2 * np.pi * 100 * intensity / 0.5)
+    events_us = lagging_events_us(intensity, FOLLOWS_LIGHT)
+    assert np.allclose(events_us, -lag_us * np.log(1 - expected / 2), atol=1, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("intensity", "share"), [(1e-3, 0.1), (0.03, 0.1), (0.1, 0.2), (0.5, 1.0), (1.4, 2.8), (2.0, 3.0), (1e3, 3.0)]
+)
+def test_dark_pixels_lag_more_than_bright_ones_within_bounds(intensity: float, share: float):
+    reference_us = lagging_events_us(0.5, replace(FOLLOWS_LIGHT, cutoff_reference=0.0))
+    # From the middle of the step.
+    lag_us, expected_us = lagging_events_us(intensity, FOLLOWS_LIGHT) - 0.5, (reference_us - 0.5) / share
+    assert len(lag_us) > 5 and np.allclose(lag_us, expected_us, atol=0.5, rtol=1e-3)
+
+
+def test_bandwidth_without_a_reference_is_the_same_at_any_light():
+    model = replace(CLEAN, cutoff_hz=100.0, cutoff_reference=0.0)
+    assert model == replace(CLEAN, cutoff_hz=100.0)
+    assert np.allclose(lagging_events_us(1e-3, model), lagging_events_us(1e3, model), atol=1e-6)
+    # A reference without a bandwidth to refer to changes nothing either.
+    clean = lagging_events_us(1e-3, CLEAN)
+    assert np.array_equal(clean, lagging_events_us(1e-3, replace(CLEAN, cutoff_reference=0.5)))
+
+
+def test_bandwidth_grows_with_the_light_while_it_rises():
+    slope, start = 40.0, 0.1
+    t_us = np.arange(0, 50_001, 50.0)
+    events = watch(slope * 1e-6 * t_us[:, None] + np.log(start), t_us, replace(FOLLOWS_LIGHT, cutoff_reference=1.0))
+    # How far the pixel is behind solves d' = slope - bandwidth * exp(slope * t) * d, as long as no bound is met.
+    first, now = (2 * np.pi * 100 * start / slope * np.exp(slope * 1e-6 * at) for at in (0.0, events.t_us))
+    behind = np.exp(-now) * (expi(now) - expi(first))
+    inside = start * np.exp(slope * 1e-6 * events.t_us) < 2.8
+    seen = (slope * 1e-6 * events.t_us - behind)[inside]
+    assert len(seen) > 3 and np.allclose(np.diff(seen), 0.2, atol=1e-4, rtol=0)
+
+
+def test_bandwidth_follows_the_light_and_not_the_leak():
+    t_us = np.arange(0, 1_000_001, 1000.0)
+    leaking = replace(CLEAN, cutoff_hz=20.0, leak_hz=20.0)
+    same, follows = (watch(np.zeros((len(t_us), 5)), t_us, replace(leaking, cutoff_reference=r)) for r in (0.0, 1.0))
+    assert len(same.t_us) > 90 and np.allclose(same.t_us, follows.t_us, atol=1e-3, rtol=0)
 
 
 def test_timestamps_jitter_by_what_was_asked_for_and_stay_within_the_recording():

@@ -90,7 +90,7 @@ MUTATIONS = (
              "test_photometry.py::test_case_18_which_end_comes_first_does_not_matter"),
     Mutation(19, LOSS, NO_INFORMATION, "if False:",
              "test_photometry.py::test_case_19_batches_without_information_change_nothing"),
-    Mutation(20, PAIRS, "np.where(counts > most_of_a_pixel(counts), 0, counts)", "counts",
+    Mutation(20, PAIRS, "np.where(hot_pixels(counts, width), 0, counts)", "counts",
              "test_photometry.py::test_case_20_a_hot_pixel_with_a_million_events_has_no_more_than_its_share_of_a_batch"),
     Mutation(21, PAIRS, "        steps = np.minimum(steps, self.max_steps)\n", "",
              "test_photometry.py::test_case_21_pairs_of_any_length_have_finite_losses"),
