@@ -129,6 +129,17 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
         )
     if summary.hot_pixels:
         found.append(f"hot pixels, 3 times busier than their neighbours, left out of training: {summary.hot_pixels:,}")
+    if summary.sensor.flicker_hz:
+        found.append(
+            f"lamps flicker at {summary.sensor.flicker_hz:.1f} Hz; {summary.sensor.flicker_share:.0%} of the pixels "
+            "follow them, and are left out of training where they are less than half"
+        )
+    if summary.sensor.clock_step_us > 1:
+        found.append(
+            f"times come in steps of {summary.sensor.clock_step_us:,} us: what moves a pixel in less cannot be told"
+        )
+    if summary.sensor.dead_pixels > 0.01 * summary.width * summary.height:
+        found.append(f"pixels that never respond, by those around them: {summary.sensor.dead_pixels:,}")
     if summary.events_per_active_pixel < _FEW_EVENTS_PER_PIXEL:
         found.append(
             f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"
@@ -169,6 +180,15 @@ def _range(estimate: Estimate) -> str:
     return f"{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g})"
 
 
+def _timing(sensor: SensorFacts) -> str:
+    clock = "microseconds" if sensor.clock_step_us == 1 else f"steps of {sensor.clock_step_us:,} us"
+    lamps = f"lamps flicker at {sensor.flicker_hz:.1f} Hz" if sensor.flicker_hz else "no lamp flickers"
+    double = (
+        f"{sensor.doubles_share:.1%} doubled within {sensor.doubles_us} us" if sensor.doubles_us else "none doubled"
+    )
+    return f"{clock}; {lamps}; {double}"
+
+
 def _lines(summary: Summary) -> list[tuple[str, str]]:
     column, row, count = summary.busiest_pixel
     seconds = (summary.end_us - summary.start_us) * 1e-6
@@ -197,6 +217,7 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
             else "not stated; " + f"by events that must cancel, on / off is {_range(summary.sensor.threshold_ratio)}",
         ),
         ("blind time", f"{_range(summary.sensor.refractory_us)} us after an event, by the shortest intervals"),
+        ("clock, lamps, doubles", _timing(summary.sensor)),
         (
             "broken pixels",
             f"{summary.hot_pixels:,} hot, {summary.sensor.dead_pixels:,} dead; "

@@ -148,6 +148,13 @@ def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Li
         ratio_why = f"by events that must cancel: {ratio.low:.2f} to {ratio.high:.2f}"
     blank = 0.0 if normalized else _MOST_BLANK * facts.blank_share
     return [
+        Line(
+            "pipeline.datamanager.doubles_us",
+            facts.doubles_us,
+            f"{facts.doubles_share:.1%} of the events repeat the one before within that time"
+            if facts.doubles_us
+            else "no crossing is reported twice",
+        ),
         Line("pipeline.datamanager.refractory_us", refractory_us, blind_why),
         Line("pipeline.datamanager.blank_share", blank, f"{facts.blank_share:.0%} of the pixels never fire"),
         Line("pipeline.model.threshold_ratio", value, ratio_why),

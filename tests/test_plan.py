@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from ebarf_ns.events.sensor_facts import UNKNOWN_SENSOR, Estimate, SensorFacts
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.plan import Line, apply_plan, plan_for
-from ebarf_ns.scene import Scene, read_scene
+from ebarf_ns.scene import ContrastThreshold, Scene, read_scene
 
 
 @pytest.fixture
@@ -39,6 +40,30 @@ def test_silence_counts_where_thresholds_do(scene: Scene):
         if line.field == "pipeline.datamanager.silent_share"
     ]
     assert shares[0] > 0 and shares[1] == 0
+
+
+def test_sensor_facts_are_those_found_unless_the_scene_states_them(scene: Scene):
+    found = SensorFacts(Estimate(480, 400, 600), Estimate(0.6, 0.5, 0.72), 3, 0.01, 1, None, 0.0, 3, 0, 0.5)
+    trajectory = read_tum(scene.trajectory)
+
+    def lines(given: Scene, facts: SensorFacts) -> dict[str, Line]:
+        return {line.field.rsplit(".", 1)[-1]: line for line in plan_for(given, trajectory, 1000, "cpu", facts=facts)}
+
+    untold = dataclasses.replace(scene, contrast_threshold=None)
+    by_recording = lines(untold, found)
+    assert by_recording["refractory_us"].value == 480 and "400 to 600 us" in by_recording["refractory_us"].reason
+    assert by_recording["threshold_ratio"].value == 0.6 and 0.08 < by_recording["threshold_deviation"].value < 0.1
+    assert (
+        0
+        < by_recording["blank_share"].value
+        < lines(untold, dataclasses.replace(found, blank_share=1.0))["blank_share"].value
+    )
+    stated = lines(dataclasses.replace(scene, contrast_threshold=ContrastThreshold(0.3, 0.2), refractory_us=7), found)
+    assert stated["refractory_us"].value == 7 and stated["threshold_ratio"].value == 0.3 / 0.2
+    assert stated["threshold_deviation"].value == 0 and "scene.json" in stated["threshold_ratio"].reason
+    nothing = lines(untold, UNKNOWN_SENSOR)
+    assert nothing["refractory_us"].value == 0 and nothing["blank_share"].value == 0
+    assert nothing["threshold_ratio"].value == 1 and nothing["threshold_deviation"].value == pytest.approx(0.5)
 
 
 def test_resolution_follows_the_pixel_footprint(scene: Scene):
@@ -136,7 +161,7 @@ def test_inspect_prints_the_plan_a_run_keeps_and_flags_overrule(trained_run: Pat
     assert kept["pipeline.model.contract"] == {k: shown["pipeline.model.contract"][k] for k in ("value", "reason")}
     assert kept["pipeline.model.samples"]["value"] == 24 and "set by flag" in kept["pipeline.model.samples"]["reason"]
     text = run_ok("ebarf", "inspect", tiny_scene)
-    assert "--pipeline.model.grid-finest" in text and "no contraction" in text and "their ratio is corrected" in text
+    assert "--pipeline.model.grid-finest" in text and "no contraction" in text and "stated: on 0.25, off 0.25" in text
     assert "samples: 24" in (trained_run / "config.yml").read_text()
 
 

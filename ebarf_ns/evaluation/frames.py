@@ -95,7 +95,8 @@ def fit_brightness(
     y = np.concatenate([image.ravel() for image in reference])
     bright = (y > _DARKEST) & (y != 1)
     if not bright.any() or np.ptp(x[bright]) == 0:
-        return [np.full_like(image, np.log(np.maximum(y, _DARKEST)).mean()) for image in rendered_log], False
+        grey = np.exp(np.log(np.maximum(y, _DARKEST)).mean())
+        return [np.full_like(image, grey) for image in rendered_log], False
     x, y = x[bright], np.log(y[bright])
     gain, offset = np.polyfit(x, y, 1)
     inverted = bool(gain < 0)

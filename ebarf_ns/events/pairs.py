@@ -123,6 +123,14 @@ class PairIndex:
         """Number of pixels that are left out for being far busier than usual."""
         return int(np.count_nonzero(np.diff(self.first))) - self._counting_pixels
 
+    def without(self, pixels: Bool[np.ndarray, "pixels"]) -> PairIndex:
+        """The same events, those of some pixels counting for nothing."""
+        counts = np.zeros(len(pixels), np.int64)
+        counts[self.busiest] = -self._less_events
+        return _counting(
+            self.events, self.first, np.where(pixels, 0, counts), self.responsive[~pixels[self.responsive]]
+        )
+
     def with_hot_pixels(self) -> PairIndex:
         """The same events, those of hot pixels counting like all others."""
         counts = np.diff(self.first)
@@ -287,9 +295,15 @@ def missed_after(events, k, first, refractory_us):
 
 
 def index_pairs(
-    chunks: Callable[[], Iterable[Recording]], width: int, height: int, memory_bytes: int = 1 << 62
+    chunks: Callable[[], Iterable[Recording]],
+    width: int,
+    height: int,
+    memory_bytes: int = 1 << 62,
+    doubles_us: int = 0,
 ) -> PairIndex:
     """Order events by pixel and time; ``chunks`` gives them in order of time, and is asked twice or more.
+
+    Events that repeat the one before within ``doubles_us`` at their pixel, with its polarity, are left out.
 
     An index beyond ``memory_bytes`` lives in a temporary file, and is made a part of the sensor at a time, with one
     more pass through the events for each part. Raises :class:`RecordingError` when no pixel has two events.
@@ -314,9 +328,31 @@ def index_pairs(
         for chunk in chunks():
             _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
         begin = end
+    if doubles_us:
+        first = _drop_doubles(events, first, doubles_us)
+        events, counts = events[: first[-1]], np.diff(first)
     hot = hot_pixels(counts, width)
     responsive = np.nonzero(~hot & ~dead_pixels(counts, width))[0]
     return _counting(events, first, np.where(hot, 0, counts), responsive)
+
+
+@njit(cache=True)
+def _drop_doubles(events, first, doubles_us):
+    """Close the gaps that they leave, in place; returns where each pixel's events begin then."""
+    kept, new_first = 0, np.zeros_like(first)
+    for pixel in range(len(first) - 1):
+        dropped, before, sum_before, last_us = 0, 0, 0, 0
+        for k in range(first[pixel], first[pixel + 1]):
+            t_us, running = events[k].t_us, events[k].running_polarity
+            polarity, sum_before = running - sum_before, running
+            if polarity == before and t_us - last_us <= doubles_us:
+                dropped += polarity
+                continue
+            before, last_us = polarity, t_us
+            events[kept].t_us, events[kept].running_polarity = t_us, running - dropped
+            kept += 1
+        new_first[pixel + 1] = kept
+    return new_first
 
 
 def _counting(events: np.ndarray, first: np.ndarray, counted: np.ndarray, responsive: np.ndarray) -> PairIndex:

@@ -16,31 +16,46 @@ if TYPE_CHECKING:
 
 _SIDE = 5
 _HOT_FACTOR, _NEVER_HOT = 3, 20
-_BUSY = 5
+_BUSY, _LEAST_ACTIVE = 5, 0.2
 
 
 def hot_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarray, "pixels"]:
-    """Pixels with over 3 times the events of the third busiest of the 24 around them, and 20 more.
+    """Pixels with over 3 times the events of the second busiest of the 24 around them, and 20 more.
 
-    The third, so that a pair of hot pixels does not excuse each other. An edge that runs along a row of pixels has
+    The second, so that a pair of hot pixels does not excuse each other. An edge that runs along a row of pixels has
     busy neighbours in that row.
     """
-    return counts > _HOT_FACTOR * _of_neighbours(counts, width, -3) + _NEVER_HOT
+    return counts > _HOT_FACTOR * _of_neighbours(counts, width, -2) + _NEVER_HOT
 
 
 def dead_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarray, "pixels"]:
-    """Pixels without any event, in the middle of pixels with 5 or more, or in a column or row that is dead throughout.
+    """Pixels without any event, in the middle of pixels with 5 or more, or in a block of columns or rows that is dead.
 
-    A column or row is dead where it has no event while a tenth of the sensor's pixels have 5 or more, and it reaches
-    from border to border: sensors with an unequal number of event and frame pixels have such blocks.
+    Some sensors lack event pixels along a border. Such a block ends at a line that is as busy as others, all along. A
+    wall or a sky that no event comes from does not end like that.
     """
     silent = counts == 0
     alone = silent & (_of_neighbours(counts, width, 2) >= _BUSY)
-    picture = silent.reshape(-1, width)
-    if np.mean(counts >= _BUSY) < 0.1:
-        return alone
-    lines = picture.all(axis=0)[None, :] | picture.all(axis=1)[:, None]
-    return alone | (lines & picture).ravel()
+    active = ~silent.reshape(-1, width)
+    lines = _dead_lines(active.mean(axis=0))[None, :] | _dead_lines(active.mean(axis=1))[:, None]
+    return alone | lines.ravel()
+
+
+def _dead_lines(active_share: np.ndarray) -> np.ndarray:
+    """Which lines of pixels are silent up to a border, and end at one that is more than half as active as usual."""
+    found = np.zeros(len(active_share), bool)
+    somewhere = np.nonzero(active_share)[0]
+    if not len(somewhere):
+        return found
+    usual = np.median(active_share[somewhere])
+    first, last = somewhere[[0, -1]]
+    if usual < _LEAST_ACTIVE:
+        return found
+    if active_share[first] > usual / 2:
+        found[:first] = True
+    if active_share[last] > usual / 2:
+        found[last + 1 :] = True
+    return found
 
 
 def _of_neighbours(counts: np.ndarray, width: int, rank: int) -> np.ndarray:

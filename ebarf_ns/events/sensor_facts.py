@@ -6,7 +6,7 @@ the scene or a flag states goes before them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from numba import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.pairs import PairIndex, index_pairs, missed_after
 from ebarf_ns.events.recording import Recording, RecordingFile
+from ebarf_ns.events.timing import clock_step_us, doubles, flicker_hz
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int64
@@ -47,6 +48,15 @@ class SensorFacts:
     """Blind time of a pixel after an event."""
     threshold_ratio: Estimate
     """C_on / C_off, with the blind time in force."""
+    doubles_us: int
+    """Events that repeat the one before at their pixel within this time are one crossing reported twice; 0: none do."""
+    doubles_share: float
+    clock_step_us: int
+    """1 for a clock of microseconds; more where a camera reads out in steps."""
+    flicker_hz: float | None
+    """Of lamps in the picture."""
+    flicker_share: float
+    """Share of the pixels that follow them."""
     hot_pixels: int
     dead_pixels: int
     """Those that cannot fire, told by neighbours that do."""
@@ -55,20 +65,26 @@ class SensorFacts:
 
 
 _UNKNOWN_RATIO = Estimate(1.0, float(np.exp(-2 * _UNKNOWN_DEVIATION)), float(np.exp(2 * _UNKNOWN_DEVIATION)))
-UNKNOWN_SENSOR = SensorFacts(Estimate(0, 0, 0), _UNKNOWN_RATIO, 0, 0, 0.0)
+UNKNOWN_SENSOR = SensorFacts(Estimate(0, 0, 0), _UNKNOWN_RATIO, 0, 0.0, 1, None, 0.0, 0, 0, 0.0)
 """Of a recording that tells nothing."""
 
 
 def identify(index: PairIndex, refractory_us: int | None = None) -> SensorFacts:
-    """What a recording tells of its sensor; a blind time that is stated goes before the one found."""
+    """What a recording without doubles tells of its sensor; a blind time that is stated goes before the one found."""
     found = estimated_refractory_us(index)
     in_force = round(found.value) if refractory_us is None else refractory_us
-    hot = index.hot_pixels
+    step_us = clock_step_us(index.events["t_us"])
+    flicker = flicker_hz(index.events, index.first, step_us)
     return SensorFacts(
         refractory_us=found,
         threshold_ratio=estimated_threshold_ratio(index, in_force),
-        hot_pixels=hot,
-        dead_pixels=len(index.first) - 1 - len(index.responsive) - hot,
+        doubles_us=0,
+        doubles_share=0.0,
+        clock_step_us=step_us,
+        flicker_hz=flicker.hz,
+        flicker_share=flicker.share_of_pixels,
+        hot_pixels=index.hot_pixels,
+        dead_pixels=len(index.first) - 1 - len(index.responsive) - index.hot_pixels,
         blank_share=len(index.blank) / max(len(index.responsive), 1),
     )
 
@@ -81,9 +97,13 @@ def identify_recording(file: RecordingFile, span_us: tuple[int, int], refractory
         if sum(map(len, kept)) > _AT_MOST_INDEXED:
             break
     try:
-        return identify(index_pairs(lambda: kept, file.width, file.height), refractory_us)
+        index = index_pairs(lambda: kept, file.width, file.height)
+        share, within_us = doubles(index.events, index.first, clock_step_us(index.events["t_us"]))
+        if within_us:
+            index = index_pairs(lambda: kept, file.width, file.height, doubles_us=within_us)
     except RecordingError:
         return UNKNOWN_SENSOR
+    return replace(identify(index, refractory_us), doubles_us=within_us, doubles_share=share)
 
 
 def estimated_refractory_us(index: PairIndex) -> Estimate:

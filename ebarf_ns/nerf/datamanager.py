@@ -29,12 +29,14 @@ from ebarf_ns.events.pairs import (
 )
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import SensorFacts, identify
+from ebarf_ns.events.timing import clock_step_us, flicker_hz
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
 from ebarf_ns.scene import Scene, check_clocks
 
 _HELDOUT_SEED = 1 << 32
 _LONGEST_HELDOUT_PAIR = 30
+_MOST_FLICKER = 0.5
 
 
 class EventDataset(InputDataset):
@@ -86,12 +88,16 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
     silent_share: float | None = None
     """Share of a batch's pairs that end while the pixel is silent, not with an event; None: as planned."""
+    doubles_us: int | None = None
+    """Leave out events that repeat the one before at their pixel within this time; 0: none; None: as found."""
     blank_share: float | None = None
     """Share of a batch's pairs that join two pixels which never fire, as parts of one surface; None: as planned."""
     refractory_us: int | None = None
     """How long a pixel is blind after an event, 0: not at all; None: as the scene states it, else as found."""
     leave_out_hot_pixels: bool = True
     """Train without the pixels that are far busier than those around them."""
+    leave_out_flicker: bool = True
+    """Train without the pixels that follow a flickering lamp, where they are less than half of all."""
     heldout_share: float = 0.05
     """Share of the recording's time whose events are kept for heldout_event_loss."""
     index_memory_gib: float = 4.0
@@ -151,15 +157,24 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         file = self._recording
         memory_bytes = int(self.config.index_memory_gib * 2**30)
         within = lambda: (chunk.between(*self.span_us) for chunk in file.chunks())  # noqa: E731
-        index = index_pairs(within, file.width, file.height, memory_bytes)
+        index = index_pairs(within, file.width, file.height, memory_bytes, self.config.doubles_us or 0)
         total, _, _ = file.span()
         if len(index.events) < total:
-            CONSOLE.print(f"left out {total - len(index.events):,} of {total:,} events, outside the trajectory's span")
+            CONSOLE.print(
+                f"left out {total - len(index.events):,} of {total:,} events: doubled, or outside the trajectory's span"
+            )
         return index
 
     @cached_property
     def _training_index(self) -> PairIndex:
-        return self.index if self.config.leave_out_hot_pixels else self.index.with_hot_pixels()
+        index = self.index if self.config.leave_out_hot_pixels else self.index.with_hot_pixels()
+        if not self.config.leave_out_flicker:
+            return index
+        flicker = flicker_hz(index.events, index.first, clock_step_us(index.events["t_us"]))
+        if not 0 < flicker.share_of_pixels < _MOST_FLICKER:
+            return index
+        CONSOLE.print(f"left out {flicker.pixels.sum():,} pixels that follow a lamp of {flicker.hz:.1f} Hz")
+        return index.without(flicker.pixels)
 
     @property
     def hot_pixels_left_out(self) -> int:

@@ -79,8 +79,10 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
         longest_pair=1,
         silent_share=0.0,
         blank_share=0.0,
+        doubles_us=0,
         refractory_us=0,
         leave_out_hot_pixels=False,
+        leave_out_flicker=False,
         train_num_rays_per_batch=1024,
     )
     return _trainer(method_name, datamanager, model, field_rate=5e-3, poses=FusedAdamConfig(lr=0.1))

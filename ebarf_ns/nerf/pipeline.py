@@ -106,8 +106,9 @@ class EbarfPipeline(VanillaPipeline):
             return {"heldout_event_loss": None}
         rays, batch = self.datamanager.next_eval(0)
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)
-        columns = (batch[name].double().cpu().numpy() for name in ("polarity_sum", "event_count", "variance"))
-        predicted = prediction((after - before).numpy(), *columns, self._threshold_ratio)
+        names = ("polarity_sum", "event_count", "variance")
+        total, count, variance = (batch[name].double().cpu().numpy() for name in names)
+        predicted = prediction((after - before).numpy(), total, count, variance, self._threshold_ratio)
         return {
             "heldout_event_loss": predicted.unexplained,
             "implied_threshold_on": predicted.threshold_on,

@@ -47,6 +47,7 @@ _LEAST = {
     "pipeline.datamanager.silent_share": 0,
     "pipeline.datamanager.refractory_us": 0,
     "pipeline.datamanager.blank_share": 0,
+    "pipeline.datamanager.doubles_us": 0,
     "pipeline.model.threshold_ratio": 1e-3,
     "pipeline.model.threshold_deviation": 0,
     "pipeline.model.threshold_prior": 0,

@@ -31,8 +31,8 @@ class SensorModel:
     cutoff_hz: float = 0.0
     """Bandwidth of the pixels, a low pass of first order on log brightness; 0: unlimited."""
     cutoff_reference: float = 0.0
-    """Linear intensity at which the bandwidth is ``cutoff_hz``; it then follows the light, cutoff_hz * clip(intensity /
-    cutoff_reference, 0.1, 3); 0: the same at any light."""
+    """Linear intensity at which the bandwidth is ``cutoff_hz``; it then follows the light,
+    cutoff_hz * clip(intensity / cutoff_reference, 0.1, 3); 0: the same at any light."""
     shot_noise_hz: float = 0.0
     """Events of either polarity out of nothing, a pixel."""
     leak_hz: float = 0.0

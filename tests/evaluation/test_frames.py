@@ -81,6 +81,33 @@ def test_gain_and_offset_of_log_brightness_are_no_error():
     assert 15 < errors["psnr"] < 40 and again["psnr"] == pytest.approx(errors["psnr"], abs=1e-4)
 
 
+def test_an_inverted_render_is_said_to_be_and_is_not_turned_over():
+    references = [picture(0), picture(1)]
+    right, inverted, grey = (
+        image_errors(renders, references)
+        for renders in (
+            [np.log(image) for image in references],
+            [-0.7 * np.log(image) for image in references],
+            [0.0 * image for image in references],
+        )
+    )
+    assert right["inverted"] == 0 and inverted["inverted"] == 1
+    assert inverted["psnr"] < grey["psnr"] and inverted["log_correlation"] < -0.9 < 0.99 < right["log_correlation"]
+
+
+def test_high_passed_correlation_sees_detail_through_a_ramp_and_no_detail_in_one():
+    random = np.random.default_rng(0)
+    detail = cv2.GaussianBlur(random.standard_normal((90, 120)), (0, 0), 1)
+    reference = np.exp(0.5 * detail / detail.std() - 2)
+    ramp = np.linspace(-3, 3, 120)[None, :] + np.zeros((90, 1))
+    sharp = image_errors([np.log(reference) + ramp], [reference])
+    empty = image_errors([ramp], [reference])
+    assert (
+        sharp["log_correlation"] < 0.5 and sharp["log_correlation_16px"] > 0.8 and sharp["log_correlation_4px"] > 0.98
+    )
+    assert abs(empty["log_correlation_4px"]) < 0.2
+
+
 def test_one_fit_for_the_whole_set():
     references = [picture(0), picture(1)]
     renders = [np.log(references[0]), np.log(references[1]) + 2]
@@ -90,7 +117,8 @@ def test_one_fit_for_the_whole_set():
 def test_a_constant_grey_render_scores_badly_and_finitely():
     errors = image_errors([np.full((24, 32), 0.3)], [picture()])
     assert 5 < errors["psnr"] < 20 and errors["ssim"] < 0.5
-    assert np.isfinite(fit_brightness([np.zeros((24, 32))], [np.zeros((24, 32))])[0]).all()
+    assert np.isfinite(fit_brightness([np.zeros((24, 32))], [np.zeros((24, 32))])[0][0]).all()
+    assert errors["log_correlation"] == errors["log_correlation_4px"] == 0 and not errors["inverted"]
 
 
 def test_saturated_pixels_leave_the_fit_and_do_not_count_where_the_render_is_brighter():
@@ -141,4 +169,5 @@ def test_lpips_is_computed_where_the_weights_are(tmp_path: Path, monkeypatch: py
 
 
 def test_frames_smaller_than_a_window_have_no_ssim():
-    assert set(image_errors([np.log(picture()[:5, :5])], [picture()[:5, :5]])) == {"psnr"}
+    small = image_errors([np.log(picture()[:5, :5])], [picture()[:5, :5]])
+    assert "psnr" in small and "ssim" not in small and small["log_correlation"] == pytest.approx(1)

@@ -69,20 +69,27 @@ def test_every_silent_pair_is_what_the_stream_says(seed: int, count: int, longes
     events = recording(seed, count)
     pairs = index_of(events).draw_silent(300, longest, (0, 1000), np.random.default_rng(seed))
     truth = by_pixel(events)
-    assert 100 < len(pairs) <= 300 and pairs.silent.all()
+    assert len(pairs) == 300 and pairs.silent.all() and np.array_equal(pairs.pixel, pairs.pixel_before)
     for pixel, t0, t1, total, number in zip(
         pairs.pixel, pairs.t0_us, pairs.t1_us, pairs.polarity_sum, pairs.event_count, strict=True
     ):
-        rows = [row for row in truth[int(pixel)] if events.t_us[row] <= t1]
+        rows = [row for row in truth.get(int(pixel), []) if events.t_us[row] <= t1]
+        if not rows:
+            # Silent from the beginning: nothing has happened between any two moments.
+            assert number == total == 0 and 0 <= t0 <= t1
+            continue
         begin = len(rows) - 1 - int(number)
         assert 0 <= number <= longest and begin >= 0
         assert events.t_us[rows[begin]] == t0 and events.polarity[rows[begin + 1 :]].sum() == total
 
 
-def test_silent_pairs_end_at_any_time_and_at_every_pixel_with_events():
+def test_silent_pairs_end_at_any_time_and_at_every_pixel_whether_it_ever_fires_or_not():
     events = recording(1, 400)
+    events = events.select(events.x + events.y < 3)
     pairs = index_of(events).draw_silent(20_000, 3, (0, 2000), np.random.default_rng(0))
-    assert set(pairs.pixel.tolist()) == set(by_pixel(events))
+    assert set(pairs.pixel.tolist()) == set(range(WIDTH * HEIGHT))
+    never = ~np.isin(pairs.pixel, list(by_pixel(events)))
+    assert never.any() and (pairs.event_count[never] == 0).all() and (pairs.duration_us[never] > 1000).any()
     # After the last event of all, every time is as likely as any other.
     late = pairs.t1_us[pairs.t1_us > 1000]
     assert np.abs(np.histogram(late, 10, (1000, 2000))[0] / len(late) - 0.1).max() < 0.02
@@ -229,32 +236,25 @@ def spaced(intervals_us: np.ndarray) -> PairIndex:
     """Brighter events of one pixel with these times between them."""
     t_us = np.r_[0, np.cumsum(intervals_us)].astype(np.int64)
     zeros = np.zeros(len(t_us), np.uint16)
-    return index_of(Recording(zeros, zeros, t_us, np.ones(len(t_us), np.int8)))
+    return index_of(Recording(zeros, zeros, t_us, np.ones(len(t_us), np.int8))).with_hot_pixels()
 
 
-@pytest.mark.parametrize(
-    ("blind_us", "spread_us", "expected"), [(1000, 5000, 1000), (0, 5000, 0), (300, 9000, 300), (5000, 10, 0)]
-)
-def test_how_long_pixels_are_blind_is_seen_where_intervals_pile_up(blind_us: int, spread_us: int, expected: int):
+def test_blank_pixels_are_joined_with_blank_ones_at_one_time_and_with_no_others():
     random = np.random.default_rng(0)
-    # Some of them soon after, as at edges; and a lamp that flickers is no blind pixel.
-    sizes = np.where(random.random(40_000) < 0.8, spread_us, spread_us / 50)
-    found = spaced(blind_us + random.exponential(sizes) + 1).refractory_us
-    assert found == pytest.approx(expected, rel=0.05, abs=2)
-
-
-def test_blind_times_are_seen_where_few_events_follow_soon():
-    # Their number rises only slowly with the time since: a hundredth come sooner than 2.3 ms.
-    random = np.random.default_rng(0)
-    assert spaced(1000 + random.gamma(2, 9000, 40_000)).refractory_us == pytest.approx(1000, rel=0.15)
-    assert spaced(random.gamma(2, 9000, 40_000)).refractory_us == 0
-    # The longer the recording, the rarer they may be.
-    assert spaced(1000 + random.gamma(2, 20_000, 250_000)).refractory_us == pytest.approx(1000, rel=0.15)
-    assert spaced(random.gamma(2, 20_000, 250_000)).refractory_us == 0
-
-
-def test_few_intervals_say_nothing_of_blind_times():
-    assert spaced(np.full(500, 1000)).refractory_us == 0
+    # The left half of the sensor fires, and the right half but for one pixel never does.
+    pixel = random.integers(0, 40 * 20, 20_000)
+    x, y = np.where(pixel % 40 < 20, pixel % 40, 35), np.where(pixel % 40 < 20, pixel // 40, 10)
+    t_us = np.sort(random.integers(0, 10**6, len(pixel)))
+    columns = (x.astype(np.uint16), y.astype(np.uint16), t_us, np.ones(len(pixel), np.int8))
+    index = index_pairs(lambda: [Recording(*columns)], 40, 20)
+    assert len(index.blank) == 20 * 20 - 1
+    pairs = index.draw_blank(2000, 40, (0, 10**6), random)
+    blank = set(index.blank.tolist())
+    assert 500 < len(pairs) < 2000
+    assert set(pairs.pixel.tolist()) | set(pairs.pixel_before.tolist()) <= blank
+    assert (pairs.duration_us == 0).all() and not pairs.silent.any() and (pairs.event_count == 0).all()
+    apart = pairs.pixel % 40 - pairs.pixel_before % 40
+    assert 2 < apart.std() < 4.5
 
 
 @pytest.mark.parametrize("steps", [1, 3, 12])
@@ -298,12 +298,14 @@ def test_what_was_missed_goes_by_the_faster_neighbour():
 def test_what_was_missed_before_the_silence_counts_too():
     # As above, with the time in which the pixel was blind after its last event but one, and after its last, in it.
     index = spaced(np.full(9, 5000))
-    pairs = index.draw_silent(500, 3, (20_000, 39_999), np.random.default_rng(0), 1000)
+    pairs = index.draw_silent(5000, 3, (20_000, 39_999), np.random.default_rng(0), 1000)
+    pairs = pairs.select(pairs.pixel == 0)
     assert np.allclose(pairs.polarity_sum, pairs.event_count * 1.0)
     assert np.allclose(pairs.event_count, np.round(pairs.event_count / 1.25) * 1.25)
     assert np.allclose(pairs.variance, pairs.event_count / 1.25 * (1 + 8 * 0.25))
     # What follows the very last one is not known.
     after = index.draw_silent(500, 1, (45_000, 50_000), np.random.default_rng(0), 1000)
+    after = after.select(after.pixel == 0)
     assert set(after.event_count.tolist()) == {0.0, 1.0}
 
 

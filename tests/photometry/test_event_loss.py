@@ -32,11 +32,11 @@ def test_threshold_loss_is_equation_five_in_thresholds():
     assert float(longer) == pytest.approx(float(loss) / 4)
 
 
-def test_while_a_pixel_is_silent_it_may_have_changed_by_less_than_a_threshold():
+def test_while_a_pixel_is_silent_half_of_a_change_within_the_thresholds_is_allowed_and_no_more_beyond():
     change = torch.tensor([0.1, 0.5, -0.25, -0.35, 0.1], requires_grad=True)
     silent = torch.tensor([True, True, True, True, False])
     allowed = nearest_allowed(change, torch.zeros(5), silent, torch.tensor(0.2), torch.tensor(0.3))
-    assert torch.allclose(allowed, torch.tensor([0.1, 0.2, -0.25, -0.3, 0.0]))
+    assert torch.allclose(allowed, torch.tensor([0.05, 0.1, -0.125, -0.15, 0.0]))
     assert not allowed.requires_grad
     reported = torch.tensor([1.0, 1.0], requires_grad=True)
     allowed = nearest_allowed(torch.tensor([1.1, 3.0]), reported, torch.tensor([True, False]), 0.2, 0.3)

@@ -2,16 +2,17 @@ import pytest
 import torch
 
 from ebarf_ns.photometry.event_loss import reported_change
-from ebarf_ns.photometry.sensor_response import Response, SensorResponse
+from ebarf_ns.photometry.sensor_response import Response, SensorResponse, thresholds_of_ratio
 
 TRUE = Response(0.3, 0.2)
 
 
-def learn(sensor: SensorResponse, events: tuple[torch.Tensor, ...], change: torch.Tensor, rate: float) -> Response:
-    optimizer = torch.optim.Adam(sensor.parameters(), lr=rate)
+def learn(sensor: SensorResponse, events: tuple[torch.Tensor, ...], change: torch.Tensor, prior: float) -> Response:
+    optimizer = torch.optim.Adam(sensor.parameters(), lr=0.02)
     for _ in range(600):
         optimizer.zero_grad()
-        (reported_change(*events, *sensor()) - change).square().mean().backward()
+        loss = (reported_change(*events, *sensor()) - change).square().mean() + prior * sensor.prior()
+        loss.backward()
         optimizer.step()
     return Response(*(float(number) for number in sensor()))
 
@@ -21,26 +22,42 @@ def random_events() -> tuple[torch.Tensor, torch.Tensor]:
     return brighter - darker, brighter + darker
 
 
-def test_finds_the_ratio_of_a_sensor_in_the_changes_that_it_reports():
+def test_refines_the_ratio_within_its_deviation_by_the_changes_that_events_report():
     events = random_events()
-    found = learn(SensorResponse(0.245, 0.245), events, reported_change(*events, *TRUE), 1e-2)
-    assert found == pytest.approx(TRUE, rel=0.02)
+    found = learn(SensorResponse(0.24, 0.25, 0.3), events, reported_change(*events, *TRUE), 1e-4)
+    assert found.threshold_on / found.threshold_off == pytest.approx(1.5, rel=0.03)
+    assert found.threshold_on * found.threshold_off == pytest.approx(0.06)
 
 
 def test_a_tenth_of_contrast_that_bright_places_lack_does_not_pass_for_a_ratio():
     polarity_sum, event_count = random_events()
     change = reported_change(polarity_sum, event_count, *TRUE) - 0.1 * 0.3 * polarity_sum.clamp(min=0)
-    found = learn(SensorResponse(0.3, 0.2), (polarity_sum, event_count), change, 1e-3)
-    assert found.threshold_on / found.threshold_off == pytest.approx(1.5, rel=0.03)
+    found = learn(SensorResponse(0.3, 0.2, 0.1), (polarity_sum, event_count), change, 1e-3)
+    assert found.threshold_on / found.threshold_off == pytest.approx(1.5, rel=0.05)
 
 
-def test_no_events_are_explained_away():
+@pytest.mark.parametrize("deviation", [0.03, 0.1, 0.5])
+def test_no_events_are_explained_away_however_long_it_is_tried(deviation: float):
     ones = torch.ones(50, dtype=torch.float64)
-    found = learn(SensorResponse(0.3, 0.2), (9 * ones, 9 * ones), 0 * ones, 0.1)
-    assert found.threshold_on > 0.3 / 3**0.5 / 1.001
+    found = learn(SensorResponse(0.3, 0.2, deviation), (0 * ones, 18 * ones), -5 * ones, 0.0)
+    least = 1.5 * torch.exp(torch.tensor(-2 * deviation))
+    assert least * 0.999 <= found.threshold_on / found.threshold_off < 1.5
 
 
-def test_not_learned_it_is_as_given():
-    sensor = SensorResponse(0.3, 0.2, learned=False)
-    assert not list(sensor.parameters()) and sensor() == (0.3, 0.2)
-    assert [float(number) for number in SensorResponse(0.3, 0.2)()] == pytest.approx([0.3, 0.2])
+def test_the_prior_holds_a_ratio_that_a_weak_ramp_pulls_at():
+    events = random_events()
+    ramp = reported_change(*events, *TRUE) + 0.002
+    free, held = (learn(SensorResponse(0.3, 0.2, 0.05), events, ramp, prior) for prior in (0.0, 0.1))
+    off = [abs(one.threshold_on / one.threshold_off - 1.5) for one in (free, held)]
+    assert off[1] < 0.2 * off[0]
+
+
+def test_without_a_deviation_the_thresholds_stand():
+    sensor = SensorResponse(0.3, 0.2)
+    assert not list(sensor.parameters()) and sensor() == (0.3, 0.2) and not sensor.learned
+    assert [float(number) for number in SensorResponse(0.3, 0.2, 0.1)()] == pytest.approx([0.3, 0.2])
+
+
+def test_thresholds_of_a_ratio_have_the_mean_asked_for():
+    on, off = thresholds_of_ratio(1.5, 0.25)
+    assert on / off == pytest.approx(1.5) and on * off == pytest.approx(0.0625)

@@ -203,12 +203,12 @@ MODEL_CHANGES = {
     "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
     "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3,
     "most_hidden": 1e-3, "outliers_from": None, "contract": True, "precision": "bfloat16", "render_variance": 20.0,
-    "broad_cells": 0,
+    "broad_cells": 0, "threshold_ratio": 1.3,
 }  # fmt: skip
 POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
 DATA_CHANGES = {
-    "train_num_rays_per_batch": 64, "longest_pair": 3, "silent_share": 0.0, "refractory_us": 2000,
-    "heldout_share": 0.2, "seed": 5,
+    "train_num_rays_per_batch": 64, "longest_pair": 3, "silent_share": 0.0, "blank_share": 0.3, "refractory_us": 2000,
+    "doubles_us": 40,    "heldout_share": 0.2, "seed": 5,
 }  # fmt: skip
 
 
