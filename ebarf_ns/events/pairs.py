@@ -172,9 +172,11 @@ class PairIndex:
         What no pixel has ever fired at is taken as one surface of one brightness, loosely: the variance is that of 30
         events. Fewer than ``count``, as many have a pixel that fires at their other end.
         """
+        if not len(self.blank):
+            count = 0
         is_blank = np.zeros(len(self.first) - 1, bool)
         is_blank[self.blank] = True
-        pixel = self.blank[random.integers(len(self.blank), size=count)]
+        pixel = self.blank[random.integers(max(len(self.blank), 1), size=count)]
         away = np.rint(random.normal(0, _BLANK_REACH * width, (2, count))).astype(np.int64)
         x, y = pixel % width + away[0], pixel // width + away[1]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y * width + x < len(is_blank))

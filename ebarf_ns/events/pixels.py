@@ -9,12 +9,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import rank_filter
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64
 
-_SIDE = 5
+_REACH = 2
 _HOT_FACTOR, _NEVER_HOT = 3, 20
 _BUSY, _LEAST_ACTIVE = 5, 0.2
 
@@ -25,7 +24,9 @@ def hot_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarr
     The second, so that a pair of hot pixels does not excuse each other. An edge that runs along a row of pixels has
     busy neighbours in that row.
     """
-    return counts > _HOT_FACTOR * _of_neighbours(counts, width, -2) + _NEVER_HOT
+    if len(counts) < 3:
+        return np.zeros(len(counts), bool)
+    return counts > _HOT_FACTOR * _second_busiest(counts, width) + _NEVER_HOT
 
 
 def dead_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarray, "pixels"]:
@@ -35,7 +36,7 @@ def dead_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndar
     wall or a sky that no event comes from does not end like that.
     """
     silent = counts == 0
-    alone = silent & (_of_neighbours(counts, width, 2) >= _BUSY)
+    alone = silent & (-_second_busiest(-counts, width) >= _BUSY)
     active = ~silent.reshape(-1, width)
     lines = _dead_lines(active.mean(axis=0))[None, :] | _dead_lines(active.mean(axis=1))[:, None]
     return alone | lines.ravel()
@@ -58,12 +59,15 @@ def _dead_lines(active_share: np.ndarray) -> np.ndarray:
     return found
 
 
-def _of_neighbours(counts: np.ndarray, width: int, rank: int) -> np.ndarray:
-    """The count at ``rank`` among the neighbours of each pixel."""
+def _second_busiest(counts: np.ndarray, width: int) -> np.ndarray:
+    """The second largest count among the neighbours of each pixel; those beyond a border are its mirror image."""
     picture = counts.reshape(-1, width)
-    size = tuple(min(_SIDE, side) for side in picture.shape)
-    around = np.ones(size, bool)
-    around[size[0] // 2, size[1] // 2] = False
-    if around.sum() < abs(rank):
-        return counts
-    return rank_filter(picture, rank, footprint=around, mode="mirror").ravel()
+    reach = [min(_REACH, side - 1) for side in picture.shape]
+    padded = np.pad(picture, [(side, side) for side in reach], mode="reflect")
+    most = second = np.full(picture.shape, np.iinfo(counts.dtype).min)
+    for down in range(2 * reach[0] + 1):
+        for right in range(2 * reach[1] + 1):
+            if (down, right) != tuple(reach):
+                one = padded[down : down + picture.shape[0], right : right + picture.shape[1]]
+                most, second = np.maximum(most, one), np.maximum(second, np.minimum(most, one))
+    return second.ravel()

@@ -206,6 +206,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         total = self.get_train_rays_per_batch() // 2
         silent = min(int(total * (self.config.silent_share or 0.0)), total - 1)
         blank = min(int(total * (self.config.blank_share or 0.0)), total - 1 - silent)
+        blank = blank if len(self._training_index.blank) else 0
         count = total - silent - blank
         random = batch_random(self.config.seed, batch)
         pairs = self._training_index.draw_accepted(

@@ -21,7 +21,12 @@ def test_help_lists_the_commands():
 
 def test_inspect_for_people_and_for_programs(tiny_scene: Path):
     text = run_ok("ebarf", "inspect", tiny_scene)
-    assert "48 x 36" in text and "ratio is corrected in training" in text and "11 keyframes" in text
+    assert (
+        "48 x 36" in text
+        and "stated: on 0.25, off 0.25" in text
+        and "no lamp flickers" in text
+        and "11 keyframes" in text
+    )
     summary = json.loads(run_ok("ebarf", "inspect", tiny_scene, "--json"))
     assert summary["width"] == 48 and summary["events"] > 5000 and summary["end_us"] <= 500_000
     assert summary["events_within_trajectory"] == summary["events"]

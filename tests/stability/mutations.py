@@ -90,7 +90,7 @@ MUTATIONS = (
              "test_photometry.py::test_case_18_which_end_comes_first_does_not_matter"),
     Mutation(19, LOSS, NO_INFORMATION, "if False:",
              "test_photometry.py::test_case_19_batches_without_information_change_nothing"),
-    Mutation(20, PAIRS, "np.where(hot_pixels(counts, width), 0, counts)", "counts",
+    Mutation(20, PAIRS, "np.where(hot, 0, counts)", "counts",
              "test_photometry.py::test_case_20_a_hot_pixel_with_a_million_events_has_no_more_than_its_share_of_a_batch"),
     Mutation(21, PAIRS, "        steps = np.minimum(steps, self.max_steps)\n", "",
              "test_photometry.py::test_case_21_pairs_of_any_length_have_finite_losses"),
@@ -114,7 +114,7 @@ MUTATIONS = (
              "test_training.py::test_case_29_every_field_of_the_configuration_changes_the_run[near]"),
     Mutation(30, "ebarf_ns/evaluation/trajectory_error.py", "if extent[1] <= _THINNEST * extent[0]:", "if False:",
              "test_gauge.py::test_case_30_where_alignment_is_not_defined_there_is_no_number"),
-    Mutation(31, "ebarf_ns/evaluation/frames.py", "gain, offset = np.polyfit(x[bright], np.log(y[bright]), 1)",
+    Mutation(31, "ebarf_ns/evaluation/frames.py", "gain, offset = np.polyfit(x, y, 1)",
              "gain, offset = 1.0, 0.0",
              "test_gauge.py::test_case_31_gain_and_offset_of_log_brightness_change_no_decibel"),
 )  # fmt: skip

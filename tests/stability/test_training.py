@@ -207,7 +207,7 @@ MODEL_CHANGES = {
 }  # fmt: skip
 POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}
 DATA_CHANGES = {
-    "train_num_rays_per_batch": 64, "longest_pair": 3, "silent_share": 0.0, "blank_share": 0.3, "refractory_us": 2000,
+    "train_num_rays_per_batch": 64, "longest_pair": 3, "silent_share": 0.0, "refractory_us": 2000,
     "doubles_us": 40,    "heldout_share": 0.2, "seed": 5,
 }  # fmt: skip
 
@@ -237,6 +237,19 @@ def test_case_29_every_field_of_the_configuration_changes_the_run(
     if key in POSE_CHANGES:
         setattr(made.pipeline.model.camera_optimizer, key, POSE_CHANGES[key])  # pyright: ignore[reportAttributeAccessIssue]
     assert first_losses(made) != unchanged, f"{key} changed nothing"
+
+
+def test_case_29_pixels_that_never_fire_are_joined_where_there_are_any(small_scene: Path, tmp_path: Path):
+    def half(given: Recording) -> Recording:
+        return given.select(given.x.astype(int) + given.y < 25)
+
+    scene = variant(small_scene, tmp_path / "scene", events=half)
+    losses = []
+    for share in (0.0, 0.3):
+        made = config(scene, tmp_path / str(share), steps=3)
+        made.pipeline.datamanager.blank_share = share  # pyright: ignore[reportAttributeAccessIssue]
+        losses.append(first_losses(made))
+    assert losses[0] != losses[1]
 
 
 # The worst that scenes can be: finite to the end, and an honest report.
