@@ -425,3 +425,36 @@ def test_drift_of_thresholds_costs_no_more_than_a_fifth(tmp_path: Path):
         scene = simulate(replace(SMALL, sensor=sensor, errors=errors, duration_s=0.8), tmp_path / f"scene{drift}")
         ends.append(trained(scene.folder, tmp_path / f"run{drift}"))
     assert ends[1]["ate_m"] <= 1.2 * ends[0]["ate_m"]
+
+
+SENSORS = {
+    "a ratio of 3": SensorModel(threshold_on=0.45, threshold_off=0.15),
+    "blind longer than most intervals": SensorModel(refractory_us=30_000),
+    "slower than what moves": SensorModel(cutoff_hz=3.0),
+    "dark pixels slower than bright ones": SensorModel(cutoff_hz=50.0, cutoff_reference=0.5),
+}
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_extreme_sensors_are_trained_to_the_end_and_judged_by_what_is_known_of_them(
+    sensor: SensorModel, tmp_path: Path
+):
+    scene = simulate(replace(SMALL, sensor=sensor, tell_thresholds=False), tmp_path / "scene")
+    last = trained(scene.folder, tmp_path)
+    assert 0 < last["heldout_event_loss"] <= 1 and np.isfinite([last["psnr"], last["log_correlation"]]).all()
+
+
+def test_a_clock_of_milliseconds(small_scene: Path, tmp_path: Path):
+    def stepped(given: Recording) -> Recording:
+        return replace(given, t_us=given.t_us // 1000 * 1000)
+
+    last = trained(variant(small_scene, tmp_path / "scene", events=stepped), tmp_path)
+    assert last["heldout_event_loss"] < SOMETHING_LEARNED
+
+
+def test_all_pixels_silent_but_a_few(small_scene: Path, tmp_path: Path):
+    def few(given: Recording) -> Recording:
+        return given.select((given.x % 16 == 8) & (given.y % 12 == 6))
+
+    last = trained(variant(small_scene, tmp_path / "scene", events=few), tmp_path)
+    assert last["heldout_event_loss"] is None or 0 <= last["heldout_event_loss"] <= 1
