@@ -94,6 +94,12 @@ class PairIndex:
         """Responsive pixels that never fire."""
         return self.responsive[np.diff(self.first)[self.responsive] == 0]
 
+    @cached_property
+    def _is_blank(self) -> Bool[np.ndarray, "pixels"]:
+        found = np.zeros(len(self.first) - 1, bool)
+        found[self.blank] = True
+        return found
+
     @property
     def max_steps(self) -> int:
         """The longest pair there is, in steps."""
@@ -174,17 +180,15 @@ class PairIndex:
         """
         if not len(self.blank):
             count = 0
-        is_blank = np.zeros(len(self.first) - 1, bool)
-        is_blank[self.blank] = True
         pixel = self.blank[random.integers(max(len(self.blank), 1), size=count)]
         away = np.rint(random.normal(0, _BLANK_REACH * width, (2, count))).astype(np.int64)
         x, y = pixel % width + away[0], pixel // width + away[1]
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y * width + x < len(is_blank))
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y * width + x < len(self._is_blank))
         other = np.where(inside, y * width + x, pixel)
         t_us, zeros = random.integers(*span_us, size=count, endpoint=True), np.zeros(count)
         variance, silent = np.full(count, _VARIANCE_OF_BLANK), zeros.astype(bool)
         pairs = EventPairs(pixel, other, t_us, t_us, zeros, zeros, variance, silent)
-        return pairs.select(inside & is_blank[other])
+        return pairs.select(inside & self._is_blank[other])
 
     def draw_accepted(
         self,

@@ -179,7 +179,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     @property
     def hot_pixels_left_out(self) -> int:
         """Number of pixels that are not trained on for being far busier than usual."""
-        return self._training_index.hot_pixels
+        return self.index.hot_pixels if self.config.leave_out_hot_pixels else 0
 
     @property
     def _heldout_blocks(self) -> HeldoutBlocks:
@@ -226,7 +226,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         parts = [pairs, drawn.select(self._heldout_blocks.training(drawn)).select(slice(silent))]
         if blank:
             # Most of them join a blank pixel with one that fires.
-            width = self._recording.width
+            width = self.train_dataset.scene.camera.width
             parts.append(self._training_index.draw_blank(4 * blank, width, self.span_us, random).select(slice(blank)))
         return joined(parts)
 
