@@ -156,6 +156,7 @@ def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Li
             else "no crossing is reported twice",
         ),
         Line("pipeline.datamanager.refractory_us", refractory_us, blind_why),
+        Line("pipeline.model.time_constant_us", *_time_constant(scene, normalized)),
         Line("pipeline.datamanager.blank_share", blank, f"{facts.blank_share:.0%} of the pixels never fire"),
         Line("pipeline.model.threshold_ratio", value, ratio_why),
         Line(
@@ -164,6 +165,14 @@ def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Li
             "how far training may refine the ratio" if deviation else "stated: nothing to refine",
         ),
     ]
+
+
+def _time_constant(scene: Scene, normalized: bool) -> tuple[float | None, str]:
+    if normalized:
+        return 0.0, "Eq. 6 takes events for immediate"
+    if scene.time_constant_us is not None:
+        return scene.time_constant_us, "as scene.json states it"
+    return None, "learned from 0 up: what delays events shows in training alone, and costs nothing where it is 0"
 
 
 def apply_plan(lines: list[Line], configuration: Any) -> list[Line]:

@@ -28,7 +28,9 @@ FORMAT, VERSION = "ebarf-scene", 1
 # A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
 _LONGEST_SPAN_RATIO = 100
 _LONGEST_REFRACTORY_US = 1_000_000
-_KEYS = "format version events trajectory groundtruth frames camera contrast_threshold refractory_us bounds"
+_LONGEST_TIME_CONSTANT_US = 1_000_000
+_SENSOR_KEYS = "contrast_threshold refractory_us time_constant_us"
+_KEYS = f"format version events trajectory groundtruth frames camera {_SENSOR_KEYS} bounds"
 FrameIntensity = Literal["linear", "srgb", "log"]
 
 
@@ -67,6 +69,8 @@ class Scene:
     contrast_threshold: ContrastThreshold | None = None
     refractory_us: int | None = None
     """How long a pixel is blind after an event."""
+    time_constant_us: float | None = None
+    """Of the photoreceptor's low pass, at the mean log brightness of what is seen."""
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner in world units."""
 
@@ -95,6 +99,7 @@ def read_scene(folder: Path) -> Scene:
         if content.get("contrast_threshold") is not None
         else None,
         refractory_us=_refractory_us(content) if content.get("refractory_us") is not None else None,
+        time_constant_us=_time_constant_us(content) if content.get("time_constant_us") is not None else None,
         bounds=_bounds(content) if content.get("bounds") is not None else None,
     )
 
@@ -150,6 +155,7 @@ def write_scene(scene: Scene) -> None:
         "camera": _camera_json(scene.camera),
         "contrast_threshold": vars(scene.contrast_threshold) if scene.contrast_threshold else None,
         "refractory_us": scene.refractory_us,
+        "time_constant_us": scene.time_constant_us,
         "bounds": scene.bounds,
     }
     if scene.frames:
@@ -289,6 +295,13 @@ def _refractory_us(content: _Object) -> int:
     value = content.integer("refractory_us")
     if not 0 <= value <= _LONGEST_REFRACTORY_US:
         raise content.wrong("refractory_us", f"whole microseconds from 0 to {_LONGEST_REFRACTORY_US}")
+    return value
+
+
+def _time_constant_us(content: _Object) -> float:
+    value = content.number("time_constant_us")
+    if not 0 <= value <= _LONGEST_TIME_CONSTANT_US:
+        raise content.wrong("time_constant_us", f"microseconds from 0 to {_LONGEST_TIME_CONSTANT_US}")
     return value
 
 

@@ -58,7 +58,11 @@ def test_sensor_facts_are_those_found_unless_the_scene_states_them(scene: Scene)
         < by_recording["blank_share"].value
         < lines(untold, dataclasses.replace(found, blank_share=1.0))["blank_share"].value
     )
-    stated = lines(dataclasses.replace(scene, contrast_threshold=ContrastThreshold(0.3, 0.2), refractory_us=7), found)
+    thresholds = ContrastThreshold(0.3, 0.2)
+    stated = lines(
+        dataclasses.replace(scene, contrast_threshold=thresholds, refractory_us=7, time_constant_us=900.0), found
+    )
+    assert by_recording["time_constant_us"].value is None and stated["time_constant_us"].value == 900
     assert stated["refractory_us"].value == 7 and stated["threshold_ratio"].value == 0.3 / 0.2
     assert stated["threshold_deviation"].value == 0 and "scene.json" in stated["threshold_ratio"].reason
     nothing = lines(untold, UNKNOWN_SENSOR)

@@ -86,15 +86,22 @@ def interpolate(
     keyframes: Poses,
     t_us: Int64[Tensor, "*batch"],
     kind: Interpolation = "linear",
+    delay_us: Float[Tensor, "*batch"] | None = None,
 ) -> Poses:
     """The poses at ``t_us``: SLERP of the rotations and LERP of the positions (Eq. 3), or both with velocities that
     run on through the keyframes, as cubic splines have them.
 
     SLERP from a to b is a · exp(u · log(a⁻¹ b)): regular where a = ±b; at exactly half a turn one of two arcs is taken.
     Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
+    With ``delay_us``, poses are those so much earlier, and have a gradient to it.
     """
+    if delay_us is not None:
+        whole_us = delay_us.detach().round()
+        t_us = t_us - whole_us.to(t_us)
     left, exact_fraction = intervals(keyframe_t_us, t_us)
     u = exact_fraction.to(keyframes.position)[..., None]
+    if delay_us is not None:
+        u = u - ((delay_us - whole_us) / keyframe_t_us.diff()[left])[..., None].to(u)
     position, quat_wxyz = keyframes
     turn = turn_between(quat_wxyz[:-1], quat_wxyz[1:])
     change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)

@@ -14,6 +14,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 
 from ebarf_ns.errors import TrainingError
+from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
@@ -61,6 +62,8 @@ class EbarfModelConfig(ModelConfig):
     ratio is stated, else as counted."""
     threshold_prior: float = 0.01
     """What a ratio one deviation off costs, where a render wrong by a threshold costs 1."""
+    time_constant_us: float | None = None
+    """With Eq. 5: of the photoreceptor, at mean brightness; 0: no delay; None: as the scene states it, else learned."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -119,7 +122,9 @@ class EbarfModel(Model):
         else:
             mean = sqrt(given.on * given.off) if given else _UNKNOWN_THRESHOLD
             on, off = thresholds_of_ratio(ratio, mean)
-        self.sensor = SensorResponse(on, off, 0.0 if self.normalized else deviation)
+        self.sensor = (
+            SensorResponse(on, off) if self.normalized else SensorResponse(on, off, deviation, config.time_constant_us)
+        )
         self.mean_threshold = (on + off) / 2
         shape = HashGridShape(
             levels=_planned(config.grid_levels),
@@ -170,10 +175,12 @@ class EbarfModel(Model):
         self.random.manual_seed(seed * 1_000_003 + step)
         self.renderer.begin_step(step, self.random)
         self.camera_optimizer.begin_step(step)
+        self.sensor.begin_step(step)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, and what the
         sensor is taken to be."""
+        self._look_back(ray_bundle)
         self.camera_optimizer.apply_to_raybundle(ray_bundle)
         rays = Rays(ray_bundle.origins, ray_bundle.directions)
         rendered = self.renderer(rays, self.random if self.training else None)
@@ -192,6 +199,18 @@ class EbarfModel(Model):
             "sensor": self.sensor(),
         }
 
+    def _look_back(self, ray_bundle: RayBundle) -> None:
+        """A photoreceptor that lags behind shows at an event's time what was there before: how long before goes by how
+        bright it is."""
+        t_us = (ray_bundle.metadata or {}).get("event_t_us")
+        if t_us is None or not self.sensor.delays:
+            return
+        with torch.no_grad():
+            poses = self.camera_optimizer.poses_at(t_us[..., 0])
+            rays = Rays(poses.position, rotate(poses.quat_wxyz, ray_bundle.directions))
+            brightness = log_brightness(self.renderer(rays).intensity, self.config.brightness)
+        ray_bundle.metadata["delay_us"] = self.sensor.delay_us(brightness)
+
     def get_loss_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None) -> dict:
         """The change of log brightness between the two rays of each pair, against what its events report."""
         before, after = outputs["brightness"][:, 0].chunk(2)
@@ -209,7 +228,7 @@ class EbarfModel(Model):
                 self.config.render_variance,
             )
         losses = {"event_loss": loss}
-        if self.sensor.learned:
+        if self.sensor.learns_ratio:
             losses["threshold_prior"] = self.config.threshold_prior * self.sensor.prior()
         self.camera_optimizer.get_loss_dict(losses)
         return losses
@@ -217,7 +236,9 @@ class EbarfModel(Model):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """How opaque the scene is, what the sensor is taken to be, and how far the keyframes have moved."""
         metrics = {"accumulation": outputs["accumulation"].detach().mean()}
-        if self.sensor.learned:
+        if self.sensor.learns_time_constant:
+            metrics["time_constant_us"] = self.sensor.time_constant_us.detach()
+        if self.sensor.learns_ratio:
             metrics |= {name: number.detach() for name, number in outputs["sensor"]._asdict().items()}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics

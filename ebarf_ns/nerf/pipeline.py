@@ -113,6 +113,7 @@ class EbarfPipeline(VanillaPipeline):
             "heldout_event_loss": predicted.unexplained,
             "implied_threshold_on": predicted.threshold_on,
             "implied_threshold_off": predicted.threshold_off,
+            "time_constant_us": max(float(self.model.sensor.time_constant_us), 0.0),
         }
 
     @property

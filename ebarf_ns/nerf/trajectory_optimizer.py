@@ -118,15 +118,17 @@ class TrajectoryOptimizer(CameraOptimizer):
         poses = self.keyframes()
         return Trajectory(self.keyframe_t_us, Poses(poses.position.detach(), poses.quat_wxyz.detach()))
 
-    def poses_at(self, t_us: Int[Tensor, "*batch"]) -> Poses:
-        """Corrected poses at given times."""
-        return interpolate(self.keyframe_t_us, self.keyframes(), t_us, self.config.interpolation or "linear")
+    def poses_at(self, t_us: Int[Tensor, "*batch"], delay_us: Float[Tensor, "*batch"] | None = None) -> Poses:
+        """Corrected poses at given times, or as much earlier as ``delay_us`` says."""
+        kind = self.config.interpolation or "linear"
+        return interpolate(self.keyframe_t_us, self.keyframes(), t_us, kind, delay_us)
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Turn event rays, given in the camera's frame at their time, into world rays; others already are."""
-        t_us = (raybundle.metadata or {}).pop("event_t_us", None)
+        metadata = raybundle.metadata or {}
+        t_us, delay_us = metadata.pop("event_t_us", None), metadata.pop("delay_us", None)
         if t_us is not None:
-            poses = self.poses_at(t_us[..., 0])
+            poses = self.poses_at(t_us[..., 0], delay_us)
             raybundle.directions = rotate(poses.quat_wxyz, raybundle.directions)
             raybundle.origins = poses.position
 

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 _MOST_DEVIATIONS = 2.0
+_UNIT_US = 8000.0
+_LEARN_EVERY = 8
+_LEAST_US = 20.0
+_SLOWEST = 8.0
+_LEVEL_SHARE = 0.05
 
 
 class Response(NamedTuple):
@@ -25,27 +33,70 @@ class SensorResponse(nn.Module):
     camera that turns one way sees any ratio explained by brightness that rises or falls all along its way, so that a
     ratio learned without a bound leaves the truth: the further it is off, the better the ramp fits. What was counted in
     the recording holds it: leaving that costs :meth:`prior`, and 2 deviations is the end.
+
+    The photoreceptor is a low pass of first order, its time constant inversely proportional to the intensity (Low & Lee
+    2024). ``time_constant_us`` is that at the mean log brightness; None: learned. At 0 nothing is computed.
     """
 
-    def __init__(self, threshold_on: float, threshold_off: float, deviation: float = 0.0):
+    def __init__(
+        self, threshold_on: float, threshold_off: float, deviation: float = 0.0, time_constant_us: float | None = 0.0
+    ):
         super().__init__()
         self.nominal = Response(threshold_on, threshold_off)
         self.deviation = deviation
         if deviation:
             self.deviations = nn.Parameter(torch.zeros(()))
+        self.learns_time_constant = time_constant_us is None
+        start = torch.tensor((time_constant_us or 0.0) / _UNIT_US)
+        if self.learns_time_constant:
+            self.time_constant = nn.Parameter(start)
+        else:
+            self.register_buffer("time_constant", start)
+        self.time_constant: Tensor
+        self.register_buffer("mean_brightness", torch.tensor(torch.nan))
+        self.mean_brightness: Tensor
 
     @property
-    def learned(self) -> bool:
-        """Whether there is anything to learn."""
+    def learns_ratio(self) -> bool:
+        """Whether the ratio of the thresholds is refined."""
         return self.deviation > 0
 
     def forward(self) -> Response:
         """What the thresholds are taken to be by now."""
-        if not self.learned:
+        if not self.learns_ratio:
             return self.nominal
         bounded = _MOST_DEVIATIONS * torch.tanh(self.deviations / _MOST_DEVIATIONS)
         uneven = torch.exp(self.deviation / 2 * bounded)
         return Response(self.nominal.threshold_on * uneven, self.nominal.threshold_off / uneven)
+
+    def begin_step(self, step: int) -> None:
+        """Let the time constant learn in every eighth step, from 0 up: its gradient takes that of all rays."""
+        if self.learns_time_constant:
+            # Not where it is used: there, at 0, a clamp has no gradient.
+            with torch.no_grad():
+                self.time_constant.clamp_(min=0)
+            self.time_constant.requires_grad_(step % _LEARN_EVERY == 0)
+
+    @property
+    def time_constant_us(self) -> Tensor:
+        """Of the photoreceptor, at the mean log brightness."""
+        return self.time_constant * _UNIT_US
+
+    @property
+    def delays(self) -> bool:
+        """Whether there is a delay that matters, or one to learn in this step."""
+        return self.time_constant.requires_grad or bool(self.time_constant_us > _LEAST_US)
+
+    def delay_us(self, brightness: Float[Tensor, "rays"]) -> Float[Tensor, "rays"]:
+        """How long ago a pixel that looks at that log brightness saw what it reports: to first order, a time constant.
+
+        At most 8 times that at the mean brightness: the dark current keeps pixels from becoming ever slower.
+        """
+        mean = torch.where(self.mean_brightness.isnan(), brightness.mean(), self.mean_brightness)
+        if self.training:
+            self.mean_brightness.copy_(mean.lerp(brightness.mean(), _LEVEL_SHARE))
+        slower = (mean - brightness).exp().clamp(max=_SLOWEST)
+        return self.time_constant_us * slower
 
     def prior(self) -> Tensor:
         """Half the squared number of deviations from the nominal ratio."""

@@ -7,7 +7,7 @@ from scipy.interpolate import BarycentricInterpolator, make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
-from ebarf_ns.geometry.trajectory import Poses, corrected, interpolate, within_span
+from ebarf_ns.geometry.trajectory import Interpolation, Poses, corrected, interpolate, within_span
 
 
 def keyframes(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, Poses]:
@@ -104,3 +104,25 @@ def test_corrections_act_in_the_cameras_frame():
     quat = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_quat()[[3, 0, 1, 2]])[None]
     moved = corrected(Poses(torch.zeros(1, 3).double(), quat), torch.tensor([[0.0, 0, 0, 1, 0, 0]]).double())
     assert torch.allclose(moved.position, torch.tensor([[0.0, 1, 0]]).double(), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["linear", "cubic"])
+def test_a_delay_is_an_earlier_time_and_has_its_gradient(kind: Interpolation):
+    t_us, poses = keyframes(6)
+    at_us = torch.linspace(float(t_us[1]), float(t_us[-1]), 40).long()
+    delay_us = torch.linspace(0, 3000, 40, dtype=torch.float64)
+    earlier = interpolate(t_us, poses, at_us - delay_us.round().long(), kind)
+    delayed = interpolate(t_us, poses, at_us, kind, delay_us.round())
+    assert torch.equal(earlier.position, delayed.position)
+
+    def place(delay_us: torch.Tensor) -> torch.Tensor:
+        found = interpolate(t_us, poses, at_us, kind, delay_us)
+        return torch.cat([found.position, quat_wxyz_to_matrix(found.quat_wxyz).flatten(1)], dim=1)
+
+    weights = torch.rand(12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    asked = (delay_us + 0.25).requires_grad_()
+    (slope,) = torch.autograd.grad((place(asked) @ weights).sum(), asked)
+    numerical = (place(asked.detach() + 2) - place(asked.detach() - 2)) @ weights / 4
+    assert torch.isfinite(slope).all()
+    away = (at_us - delay_us - t_us[:, None]).abs().amin(dim=0) > 3
+    assert torch.allclose(slope[away], numerical[away], rtol=1e-3, atol=1e-9)

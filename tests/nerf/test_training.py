@@ -97,6 +97,26 @@ def test_a_ratio_of_thresholds_stands_where_it_is_stated_and_is_counted_where_it
     assert ratios["wrong"] == 1 and ratios["untold"] == pytest.approx(1.5, rel=0.1)
 
 
+def test_a_time_constant_is_found_where_there_is_one_and_not_where_there_is_none(tmp_path: Path):
+    found = {}
+    for cutoff_hz in (0.0, 30.0):
+        sensor = SensorModel(cutoff_hz=cutoff_hz, cutoff_reference=0.3 if cutoff_hz else 0.0)
+        size = {"width": 48, "height": 36, "focal_px": 41.0}
+        made = Simulation(speed=3, duration_s=1, frames=1, rays_per_pixel=4, sensor=sensor, **size)
+        scene = simulate(made, tmp_path / f"{cutoff_hz} Hz").folder
+        (scene / "trajectory.txt").write_bytes((scene / "groundtruth.txt").read_bytes())
+        for given_us in (None, 0.0) if cutoff_hz else (None,):
+            chosen = config(scene, tmp_path / f"run {cutoff_hz} {given_us}", steps=400)
+            model, chosen.pipeline.datamanager.train_num_rays_per_batch = chosen.pipeline.model, 512  # pyright: ignore[reportAttributeAccessIssue]
+            model.grid_table_size_log2, model.grid_levels, model.grid_finest, model.samples = 13, 6, 128, 12  # pyright: ignore[reportAttributeAccessIssue]
+            model.camera_optimizer.mode, model.time_constant_us = "off", given_us  # pyright: ignore[reportAttributeAccessIssue]
+            ready = trainer(chosen)
+            ready.train()
+            found[cutoff_hz, given_us] = ready.pipeline.evaluate()
+    assert found[0.0, None]["time_constant_us"] < 200 and found[30.0, None]["time_constant_us"] > 1000
+    assert found[30.0, None]["heldout_event_loss"] < 0.9 * found[30.0, 0.0]["heldout_event_loss"]
+
+
 @pytest.mark.slow
 def test_unknown_thresholds_are_found_up_to_their_scale(tmp_path: Path):
     sensor = SensorModel(threshold_on=0.4, threshold_off=0.25)

@@ -54,10 +54,38 @@ def test_the_prior_holds_a_ratio_that_a_weak_ramp_pulls_at():
 
 def test_without_a_deviation_the_thresholds_stand():
     sensor = SensorResponse(0.3, 0.2)
-    assert not list(sensor.parameters()) and sensor() == (0.3, 0.2) and not sensor.learned
+    assert not list(sensor.parameters()) and sensor() == (0.3, 0.2) and not sensor.learns_ratio
     assert [float(number) for number in SensorResponse(0.3, 0.2, 0.1)()] == pytest.approx([0.3, 0.2])
 
 
 def test_thresholds_of_a_ratio_have_the_mean_asked_for():
     on, off = thresholds_of_ratio(1.5, 0.25)
     assert on / off == pytest.approx(1.5) and on * off == pytest.approx(0.0625)
+
+
+def test_dark_pixels_lag_behind_longer_in_inverse_proportion_to_their_intensity():
+    sensor = SensorResponse(0.25, 0.25, time_constant_us=2000.0)
+    assert not list(sensor.parameters()) and sensor.delays
+    intensity = torch.tensor([0.01, 0.5, 1.0, 2.0])
+    mean = float(intensity.log().mean().exp())
+    # The darkest would be late by 32 times the time constant.
+    expected_us = [16_000, *(2000 * mean / intensity[1:]).tolist()]
+    assert sensor.delay_us(intensity.log()).tolist() == pytest.approx(expected_us)
+
+
+def test_a_time_constant_is_learned_from_signals_seen_late_and_stays_at_0_where_they_are_not():
+    t = torch.linspace(0, 1, 4000, dtype=torch.float64)
+    signal = lambda t: torch.sin(9 * t) + 0.5 * torch.sin(31 * t + 1)  # noqa: E731
+    for true_us in (0.0, 3000.0):
+        sensor = SensorResponse(0.25, 0.25, time_constant_us=None).double()
+        optimizer = torch.optim.Adam(sensor.parameters(), lr=0.01)
+        seen = signal(t - true_us * 1e-6)
+        for step in range(1600):
+            sensor.begin_step(step)
+            optimizer.zero_grad()
+            if sensor.time_constant.requires_grad:
+                loss = (signal(t - sensor.delay_us(torch.zeros_like(t)) * 1e-6) - seen).square().mean()
+                loss.backward()
+                optimizer.step()
+        assert float(sensor.time_constant_us) == pytest.approx(true_us, abs=30)
+    assert not SensorResponse(0.25, 0.25).delays
