@@ -64,6 +64,9 @@ class EbarfModelConfig(ModelConfig):
     """What a ratio one deviation off costs, where a render wrong by a threshold costs 1."""
     time_constant_us: float | None = None
     """With Eq. 5: of the photoreceptor, at mean brightness; 0: no delay; None: as the scene states it, else learned."""
+    time_constant_prior: float = 0.001
+    """What each of its milliseconds costs, where a render wrong by a threshold costs 1: delay that poses could as well
+    explain is theirs."""
     brightness: BrightnessKind = "log"
     """Log brightness of an intensity: lin_log is Eq. 2."""
     intensity_range: IntensityRange = "positive"
@@ -230,6 +233,8 @@ class EbarfModel(Model):
         losses = {"event_loss": loss}
         if self.sensor.learns_ratio:
             losses["threshold_prior"] = self.config.threshold_prior * self.sensor.prior()
+        if self.sensor.learns_time_constant:
+            losses["time_constant_prior"] = self.config.time_constant_prior * 1e-3 * self.sensor.time_constant_us
         self.camera_optimizer.get_loss_dict(losses)
         return losses
 

@@ -52,6 +52,7 @@ _LEAST = {
     "pipeline.model.threshold_deviation": 0,
     "pipeline.model.threshold_prior": 0,
     "pipeline.model.time_constant_us": 0,
+    "pipeline.model.time_constant_prior": 0,
     "pipeline.datamanager.heldout_share": 0,
     "pipeline.datamanager.index_memory_gib": 1e-6,
     "pipeline.model.grid_levels": 1,
