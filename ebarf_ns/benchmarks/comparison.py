@@ -13,15 +13,15 @@ import numpy as np
 import torch
 
 from ebarf_ns.benchmarks.engine import machine
-from ebarf_ns.benchmarks.manifest import TRUE, Manifest, Other
+from ebarf_ns.benchmarks.manifest import TRUE, Manifest, Other, Stated
 from ebarf_ns.benchmarks.training import train
 from ebarf_ns.errors import BenchmarkError
 from ebarf_ns.evaluation.outside import evaluate_files
 from ebarf_ns.files import whole_file, whole_folder
 from ebarf_ns.geometry.trajectory import Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
-from ebarf_ns.scene import Scene, read_scene, write_scene
-from ebarf_ns.simulation.simulate import simulate
+from ebarf_ns.scene import ContrastThreshold, Scene, read_scene, write_scene
+from ebarf_ns.simulation.simulate import Simulation, simulate
 from ebarf_ns.simulation.trajectory_errors import NO_ERRORS, perturb
 
 _ANOTHER_WORLD = 0.1
@@ -66,7 +66,7 @@ def run_comparison(
 
     A training that fails is a result too: it has an ``error`` and no evaluations.
     """
-    todo = jobs(manifest)
+    todo = [job for job in jobs(manifest) if job.trajectory != TRUE or _has_reference(manifest.scenes[job.scene])]
     records = []
     for done, job in enumerate(todo):
         progress(done, len(todo), f"{job.method}, {job.scene}, {job.trajectory}, seed {job.seed}, {job.seconds:g} s")
@@ -87,6 +87,10 @@ def run_comparison(
     with whole_file(folder / "records.json") as temporary:
         temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return result
+
+
+def _has_reference(source: Simulation | Stated) -> bool:
+    return isinstance(source, Simulation) or read_scene(source.folder).groundtruth is not None
 
 
 def _result(manifest: Manifest, job: Job, folder: Path) -> dict[str, Any]:
@@ -115,27 +119,41 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
     """The scene folder that a training gets, as simulated or as given, with the trajectory that it shall have; and what
     that was made of."""
     source = manifest.scenes[job.scene]
-    if not isinstance(source, Path):
+    if isinstance(source, Simulation):
         simulation = replace(source, seed=job.seed)
-        source = folder / "scenes" / _named(f"{job.scene}-{job.seed}", simulation)
-        if not (source / "scene.json").is_file():
-            simulate(simulation, source)
+        simulated = folder / "scenes" / _named(f"{job.scene}-{job.seed}", simulation)
+        if not (simulated / "scene.json").is_file():
+            simulate(simulation, simulated)
+        scene, stated = read_scene(simulated), {}
+    else:
+        scene, stated = read_scene(source.folder), _stated(source)
     errors = NO_ERRORS if job.trajectory == TRUE else manifest.trajectories[job.trajectory]
-    scene = read_scene(source)
-    made_of = _contents(scene), errors
-    if errors is None:
-        return source, made_of
+    made_of = _contents(scene), errors, *([stated] if stated else [])
+    if errors is None and not stated:
+        return scene.folder, made_of
     made = folder / "scenes" / _named(f"{job.scene}-{job.seed}-{job.trajectory}", made_of, job.seed)
     if not (made / "scene.json").is_file():
-        true = _true_keyframes(scene)
-        _check_bounds_are_of_reference(scene, true)
+        true = None if errors is None else _true_keyframes(scene)
+        if true is not None:
+            _check_bounds_are_of_reference(scene, true)
         with whole_folder(made) as temporary:
             # Everything else stays where it is.
-            trajectory = temporary / "trajectory.txt"
-            write_tum(trajectory, perturb(true, errors, job.seed))
-            lower_upper = scene.bounds and tuple(tuple(errors.scale * one for one in corner) for corner in scene.bounds)
-            write_scene(replace(scene, folder=temporary, trajectory=trajectory, bounds=lower_upper or None))
+            scene = replace(scene, folder=temporary, **stated)
+            if true is not None and errors is not None:
+                trajectory = temporary / "trajectory.txt"
+                write_tum(trajectory, perturb(true, errors, job.seed))
+                bounds = scene.bounds and tuple(tuple(errors.scale * one for one in corner) for corner in scene.bounds)
+                scene = replace(scene, trajectory=trajectory, bounds=bounds or None)
+            write_scene(scene)
     return made, made_of
+
+
+def _stated(source: Stated) -> dict[str, Any]:
+    """What is stated of a scene's sensor, by the names that scenes have for it."""
+    facts = {name: getattr(source, name) for name in ("refractory_us", "time_constant_us")}
+    if source.threshold_on is not None and source.threshold_off is not None:
+        facts["contrast_threshold"] = ContrastThreshold(source.threshold_on, source.threshold_off)
+    return {name: fact for name, fact in facts.items() if fact is not None}
 
 
 def _contents(scene: Scene) -> object:

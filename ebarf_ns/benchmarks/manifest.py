@@ -38,6 +38,17 @@ class Method:
 
 
 @dataclass(frozen=True)
+class Stated:
+    """A scene folder, with facts of its sensor stated that its scene.json may not state."""
+
+    folder: Path
+    threshold_on: float | None = None
+    threshold_off: float | None = None
+    refractory_us: int | None = None
+    time_constant_us: float | None = None
+
+
+@dataclass(frozen=True)
 class Other:
     """What another program made of a scene: it joins by its files."""
 
@@ -57,8 +68,8 @@ class Manifest:
     """A comparison."""
 
     methods: dict[str, Method]
-    scenes: dict[str, Simulation | Path]
-    """What to simulate, for each seed anew, or a scene folder with a reference trajectory."""
+    scenes: dict[str, Simulation | Stated]
+    """What to simulate, for each seed anew, or a scene folder; without a reference trajectory, it has no floor."""
     trajectories: dict[str, TrajectoryErrors | None]
     """What is wrong with the initial trajectory; None: the scene folder's own."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -166,10 +177,15 @@ class _Reader:
             raise self.wrong(f"{place}.command", method.command, "what follows ns-train, as a shell would read it")
         return method
 
-    def scene(self, content: object, place: str) -> Simulation | Path:
+    def scene(self, content: object, place: str) -> Simulation | Stated:
         if isinstance(content, str):
-            return Path(content)
+            return Stated(Path(content))
         values = self.mapping(content, place)
+        if "folder" in values:
+            stated = self.make(Stated, values, place)
+            if (stated.threshold_on is None) != (stated.threshold_off is None):
+                raise self.wrong(place, values, "both threshold_on and threshold_off, or neither")
+            return stated
         if "errors" in values:
             raise BenchmarkError(f"{self.path}: {place}.errors: expected under trajectories")
         sensor = self.make(SensorModel, values.pop("sensor", {}), f"{place}.sensor")

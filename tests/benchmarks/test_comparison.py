@@ -10,7 +10,7 @@ import pytest
 
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
-from ebarf_ns.scene import Scene, read_scene
+from ebarf_ns.scene import ContrastThreshold, Scene, read_scene
 from tests.conftest import run_command, run_ok
 
 MANIFEST = """
@@ -98,6 +98,26 @@ def test_a_scene_made_anew_is_measured_anew(comparison: Path, tmp_path: Path):
             file.write(line)
         run_command("ebarf", "bench", tmp_path / "given.yaml", "--output", tmp_path / "out")
         assert len(list((tmp_path / "out" / "results").iterdir())) == number + 1
+
+
+def test_facts_are_stated_beside_a_scene_and_no_floor_goes_without_a_reference(comparison: Path, tmp_path: Path):
+    folder = shutil.copytree(made(comparison, "drift").events.parent, tmp_path / "scene")
+    content = json.loads((folder / "scene.json").read_text())
+    (folder / "scene.json").write_text(json.dumps({**content, "groundtruth": None, "contrast_threshold": None}))
+    facts = "threshold_on: 0.3, threshold_off: 0.2, refractory_us: 400"
+    (tmp_path / "given.yaml").write_text(
+        "methods:\n  broken: ebarf --pipeline.model.samples 0\n  floor: {command: enerf, role: floor}\n"
+        f"scenes: {{given: {folder}, stated: {{folder: {folder}, {facts}}}}}\n"
+        "trajectories: {given: as given}\nseeds: [0]\nseconds: [1]\n"
+    )
+    result = json.loads(
+        run_command("ebarf", "bench", tmp_path / "given.yaml", "--output", tmp_path / "out", "--json").output
+    )
+    assert [(one["method"], one["scene"]) for one in result["records"]] == [("broken", "given"), ("broken", "stated")]
+    (stated,) = (tmp_path / "out" / "scenes").iterdir()
+    scene, given = read_scene(stated), read_scene(folder)
+    assert scene.contrast_threshold == ContrastThreshold(0.3, 0.2) and scene.refractory_us == 400
+    assert given.contrast_threshold is None and scene.trajectory.samefile(given.trajectory)
 
 
 def test_bounds_of_another_world_than_the_groundtruths_are_named(comparison: Path, tmp_path: Path):

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from ebarf_ns.benchmarks.comparison import jobs
-from ebarf_ns.benchmarks.manifest import TRUE, read_manifest
+from ebarf_ns.benchmarks.manifest import TRUE, Stated, read_manifest
 from ebarf_ns.errors import BenchmarkError
 from ebarf_ns.simulation.simulate import Simulation
 from tests.conftest import REPOSITORY
@@ -15,6 +15,7 @@ methods:
 scenes:
   room: {scene: orbit, frames: 2, sensor: {leak_hz: 0.1}}
   slide: some/folder
+  dim: {folder: other, refractory_us: 300}
 trajectories:
   white: {position_noise: 0.03}
   given: as given
@@ -40,7 +41,12 @@ def test_a_manifest_says_what_is_compared(tmp_path: Path):
     assert manifest.methods["floor"].words[1:] == ["--pipeline.model.camera-optimizer.mode", "off"]
     room = manifest.scenes["room"]
     assert isinstance(room, Simulation) and room.scene == "orbit" and room.sensor.leak_hz == 0.1
-    assert manifest.scenes["slide"] == Path("some/folder") and manifest.others[0].refined == tmp_path / "theirs.txt"
+    assert (
+        manifest.scenes["slide"] == Stated(Path("some/folder"))
+        and manifest.others[0].refined == tmp_path / "theirs.txt"
+    )
+    dim = manifest.scenes["dim"]
+    assert isinstance(dim, Stated) and (dim.folder, dim.threshold_on, dim.refractory_us) == (Path("other"), None, 300)
     white = manifest.trajectories["white"]
     assert (
         white and white.position_noise == 0.03 and white.rotation_noise_rad == 0 and not manifest.trajectories["given"]
@@ -49,7 +55,7 @@ def test_a_manifest_says_what_is_compared(tmp_path: Path):
 
 def test_floors_are_trained_once_whatever_the_trajectory(tmp_path: Path):
     found = jobs(read(tmp_path, WHOLE))
-    assert len(found) == len(set(found)) == 2 * 2 * 2 * (2 + 1)
+    assert len(found) == len(set(found)) == 2 * 3 * 2 * (2 + 1)
     assert {job.trajectory for job in found if job.method == "floor"} == {TRUE}
     names = {job.name("this") for job in found}
     assert len(names) == len(found) and all("/" not in name for name in names)
@@ -85,6 +91,7 @@ def test_shipped_manifests_are_whole(path: Path):
         (WHOLE.replace("theirs.txt", "nothing.txt"), "names nothing.txt, but there is no such file"),
         (WHOLE.replace("theirs, scene: room", "theirs, scene: hall"), "of scene 'hall'"),
         (WHOLE.replace("0.03}", "1e-2}"), "trajectories.white.position_noise is '1e-2', expected float"),
+        (WHOLE.replace("refractory_us: 300", "threshold_on: 0.3"), "both threshold_on and threshold_off"),
         (WHOLE.replace("scene: orbit", "scene: nope"), "scenes.room.scene is 'nope'"),
         (WHOLE.replace("frames: 2", "frames: 2, errors: {}"), "scenes.room.errors: expected under trajectories"),
         (WHOLE.replace("mode off", "mode 'off"), "methods.floor.command"),
