@@ -46,7 +46,8 @@ def _trainer(
             },
         },
         logging=LoggingConfig(steps_per_log=10),
-        viewer=ViewerConfig(num_rays_per_chunk=4096),
+        # Whoever reaches a viewer can drive it.
+        viewer=ViewerConfig(num_rays_per_chunk=4096, websocket_host="127.0.0.1"),
         vis="viewer",
     )
 

@@ -250,7 +250,8 @@ class EbarfModel(Model):
 
     def _follow_display_range(self, brightness: Float[Tensor, "rays"]) -> None:
         low, high = torch.quantile(brightness, torch.tensor([0.02, 0.98], device=brightness.device))
-        self.display_range.lerp_(torch.stack([low, torch.maximum(high, low + 0.1)]), 0.05)
+        seen = torch.stack([low, torch.maximum(high, low + 0.1)])
+        self.display_range.lerp_(seen.where(seen.isfinite().all(), self.display_range), 0.05)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Grey with the true accumulation as alpha, so that exported point clouds leave empty space empty."""

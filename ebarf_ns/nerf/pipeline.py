@@ -19,6 +19,7 @@ from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world, t
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
 from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.nerf.checkpoints import unsealed
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras
 from ebarf_ns.nerf.model import EbarfModel
@@ -99,6 +100,11 @@ class EbarfPipeline(VanillaPipeline):
         self.train()
         # JSON knows no NaN.
         return {name: None if value != value else value for name, value in results.items()}
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Take the parameters of a checkpoint that is whole; what nerfstudio's scripts load comes this way too."""
+        with one_line_errors():
+            super().load_pipeline(unsealed(loaded_state, f"step-{step:09d}.ckpt"), step)
 
     def _heldout(self) -> dict[str, float | None]:
         """How well held-out events are predicted, and the contrast thresholds by which they would be best."""

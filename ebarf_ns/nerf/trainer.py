@@ -1,15 +1,17 @@
 """Training within a budget of steps or seconds, with every evaluation on record and nothing half written."""
 
 import json
+import math
 import platform
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import reduce
+from functools import cached_property, reduce
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from pickle import UnpicklingError
 from time import monotonic
 from typing import Any
 
@@ -32,13 +34,17 @@ from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
+from ebarf_ns.nerf.checkpoints import newest_whole, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.nerf.pipeline import EbarfPipeline
+from ebarf_ns.nerf.run_folder import take_folder
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
-from ebarf_ns.scene import check_bounds, read_scene
+from ebarf_ns.scene import Scene, check_bounds, read_scene
 
-_SKIPPED_IN_A_ROW = 10
+_SKIPPED_IN_A_ROW, _BELIEVED = 10, 2
+_KNOWN, _BEYOND_REASON = 20, 1e4
+_SAMPLES_OF_EVENTS = 64
 _LEAST = {
     "machine.seed": 0,
     "pipeline.datamanager.train_num_rays_per_batch": 2,
@@ -128,10 +134,31 @@ class BudgetDecayScheduler(Scheduler):
 
 
 class GuardedOptimizers(Optimizers):
-    """Steps all groups, or none where any gradient is not finite: one bad batch must not poison Adam's moments."""
+    """Steps all groups, or none where any gradient is not finite, or 10,000 times its usual norm.
+
+    One bad batch must not poison Adam's moments, which forget slowly. Gradients that stay so large are taken from the
+    third on: then that is their norm.
+    """
 
     skipped = 0
     skipped_in_a_row = 0
+    usual: Tensor | None = None
+    """Running mean of the norm of each parameter's gradient, and the number of gradients, up to 99."""
+
+    def _trusted(self, parameters: list[nn.Parameter]) -> bool:
+        zero = torch.zeros((), device=parameters[0].device)
+        norms = torch.stack([zero if one.grad is None else one.grad.float().norm() for one in parameters])
+        if self.usual is None or self.usual.shape[1] != len(parameters):
+            self.usual = torch.zeros(2, len(parameters))
+        usual, count = self.usual.to(norms)
+        finite = bool(norms.isfinite().all())
+        beyond = (count >= _KNOWN) & (norms > _BEYOND_REASON * usual)
+        if finite and (self.skipped_in_a_row >= _BELIEVED or not bool(beyond.any())):
+            seen = norms > 0
+            usual = usual.where(~seen, usual.lerp(norms, 1 / (count + 1).clamp(max=100)))
+            self.usual = torch.stack([usual, (count + seen).clamp(max=99)])
+            return True
+        return False
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Raises :class:`TrainingError` when too many steps in a row had to be skipped."""
@@ -139,10 +166,9 @@ class GuardedOptimizers(Optimizers):
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         # A gradient scaler looks for overflow itself, and lowers its scale when it finds it. Accumulating gradients, no
         # group may be due.
-        trusted = grad_scaler.is_enabled() or not gradients
-        if trusted or bool(torch.stack([gradient.sum() for gradient in gradients]).isfinite().all()):
+        if grad_scaler.is_enabled() or not gradients or self._trusted(parameters):
             # A step in which the keyframes do not learn says nothing of their gradients.
-            if len(gradients) == len(parameters):
+            if all(one.grad is not None for one in self.parameters.get("camera_opt", ())):
                 self.skipped_in_a_row = 0
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
@@ -162,6 +188,10 @@ class EbarfTrainerConfig(TrainerConfig):
     steps before; all schedules follow."""
     evaluations: int = 8
     """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
+    overwrite: bool = False
+    """Begin anew in a folder that holds a run."""
+    allow_changed_scene: bool = False
+    """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
     averaged_steps: int = 100
     """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
 
@@ -178,6 +208,9 @@ class EbarfTrainer(Trainer):
         self.train_seconds = 0.0
         self.event_pairs = 0
         self.steps_done = 0
+        self.evaluated_step = self.saved_step = 0
+        self.last_loss = math.nan
+        self.signal = 0
         self.mean: list[Tensor] | None = None
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
@@ -186,13 +219,28 @@ class EbarfTrainer(Trainer):
                 if value is not None and not value > 0:
                     raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected more than 0")
             self._check_settings()
-            self._plan()
-            super().setup(test_mode)
-            if self.progress() >= 1:
-                raise TrainingError(
-                    f"the loaded run has used its budget ({self.steps_done} steps, {self.train_seconds:.0f} s); "
-                    "expected a larger --max-num-iterations or --max-train-seconds to go on"
-                )
+            self._take_folder()
+            try:
+                self._plan()
+                super().setup(test_mode)
+                if self.progress() >= 1:
+                    raise TrainingError(
+                        f"the loaded run has used its budget ({self.steps_done} steps, {self.train_seconds:.0f} s); "
+                        "expected a larger --max-num-iterations or --max-train-seconds to go on"
+                    )
+            except BaseException:
+                self._release_folder()
+                raise
+
+    @check_main_thread
+    def _release_folder(self) -> None:
+        self.lock.release()
+
+    @check_main_thread
+    def _take_folder(self) -> None:
+        loaded = self._loaded_path
+        goes_on = loaded is not None and loaded.parent.resolve() == (self.base_dir / "nerfstudio_models").resolve()
+        self.lock = take_folder(self.base_dir, goes_on, self.config.overwrite)
 
     def _check_settings(self) -> None:
         for flag, least in _LEAST.items():
@@ -214,6 +262,7 @@ class EbarfTrainer(Trainer):
         scene = read_scene(Path(folder))
         trajectory = read_tum(scene.trajectory)
         check_bounds(scene, trajectory)
+        self._check_scene_is_that_of_resumed_run(scene)
         file = RecordingFile(scene.events, scene.camera.width, scene.camera.height)
         events, _, _ = file.span()
         refractory_us = scene.refractory_us if datamanager.refractory_us is None else datamanager.refractory_us  # pyright: ignore[reportAttributeAccessIssue]
@@ -228,13 +277,24 @@ class EbarfTrainer(Trainer):
 
     def _lines_of_resumed_run(self, lines: list[Line]) -> list[Line]:
         """The plan that a loaded checkpoint was made by, whatever would be planned on this machine today."""
-        loaded = self._loaded_path()
-        kept = loaded.parent.parent / "metrics.jsonl" if loaded else None
-        if kept is None or not kept.is_file():
-            return lines
-        before = json.loads(kept.read_text(encoding="utf-8").splitlines()[0]).get("plan", {})
+        before = self._header_of_resumed_run().get("plan", {})
         resumed = {field: Line(field, made["value"], "as in the run resumed") for field, made in before.items()}
         return [resumed.get(line.field, line) for line in lines]
+
+    def _header_of_resumed_run(self) -> dict[str, Any]:
+        kept = self._loaded_path.parent.parent / "metrics.jsonl" if self._loaded_path else None
+        if kept is None or not kept.is_file():
+            return {}
+        return json.loads(kept.read_text(encoding="utf-8").splitlines()[0])
+
+    def _check_scene_is_that_of_resumed_run(self, scene: Scene) -> None:
+        before, now = self._header_of_resumed_run().get("scene_digest"), scene_digest(scene)
+        changed = [part for part in now if before[part] != now[part]] if isinstance(before, dict) else []
+        if changed and not self.config.allow_changed_scene:
+            raise TrainingError(
+                f"{scene.folder}: {', '.join(changed)} changed since {self._loaded_path} was made; expected the scene "
+                "that it was trained on, or --allow-changed-scene True"
+            )
 
     @check_main_thread
     def _keep_plan(self) -> None:
@@ -252,13 +312,42 @@ class EbarfTrainer(Trainer):
         return max(by_steps, self.train_seconds / seconds if seconds else 0.0)
 
     def train(self) -> None:
-        """Train to the end of the budget."""
-        with one_line_errors():
-            self._begin_metrics()
-            super().train()
+        """Train to the end of the budget, or to a signal: 130 or 143 is then the exit code, and nothing is lost."""
+        try:
+            with one_line_errors(), self._signals():
+                self._begin_metrics()
+                super().train()
+        finally:
+            self._release_folder()
+        if self.signal:
+            raise SystemExit(128 + self.signal)
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """The first Ctrl-C or SIGTERM ends training after the step that is under way, a second one the process."""
+
+        def stop(number: int, _: Any) -> None:
+            CONSOLE.print(f"{signal.Signals(number).name}: ends after this step; once more, and it ends at once")
+            self.signal, self.stop_training = number, True
+            for one in before:
+                signal.signal(one, signal.SIG_DFL)
+
+        before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            before = {one: signal.signal(one, stop) for one in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for one, handler in before.items():
+                signal.signal(one, handler)
 
     def _after_train(self) -> None:
-        self.save_checkpoint(self.step)
+        if self.signal:
+            if self.steps_done and self.evaluated_step != self.steps_done:
+                self._evaluate(self.steps_done - 1, self.last_loss)
+            self.save_checkpoint(self.step)
+            self._write_report()
+            return
         self._write_report()
         super()._after_train()
 
@@ -283,15 +372,21 @@ class EbarfTrainer(Trainer):
         except TrainingError as error:
             # A batch follows from its step and the seed: with the state before it, the step can be looked into.
             self.save_checkpoint(step)
-            raise TrainingError(f"{error}; --load-checkpoint {self._checkpoint_path()} does the last again") from None
+            saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
+            again = f"; --load-checkpoint {saved[-1]} does what came after it again" if saved else ""
+            raise TrainingError(f"{error}{again}") from None
         self.steps_done = step + 1
         self._average()
         self.train_seconds = self._agreed(self.train_seconds + monotonic() - started)
         self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2 * self.world_size
         self.pipeline.record_cost(self.train_seconds, self.event_pairs)
         after = self.progress()
+        self.last_loss = float(result[0].detach())
+        if after >= 1:
+            # Evaluation may fail, or take long: what was learned is safe before.
+            self.save_checkpoint(step)
         if int(after * self.config.evaluations) > int(before * self.config.evaluations) or after >= 1:
-            self._evaluate(step, float(result[0].detach()))
+            self._evaluate(step, self.last_loss)
         if after >= 1:
             self.stop_training = True
         return result
@@ -337,6 +432,7 @@ class EbarfTrainer(Trainer):
     @check_main_thread
     def _evaluate(self, step: int, loss: float) -> None:
         final = self.progress() >= 1
+        self.evaluated_step = self.steps_done
         with self._averaged():
             results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
             write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
@@ -391,8 +487,8 @@ class EbarfTrainer(Trainer):
             "threads": torch.get_num_threads(),
             "seed": self.config.machine.seed,
             "scene": str(scene.folder.resolve()),
-            "scene_digest": _digest((scene.folder / "scene.json").read_bytes() + scene.trajectory.read_bytes()),
-            "config_digest": _digest(yaml.dump(configuration).encode()),
+            "scene_digest": scene_digest(scene),
+            "config_digest": _digest(json.dumps(configuration, default=_named).encode()),
             "hash_grid": fastest_carrier(torch.zeros(0, 3, device=self.device)),
             "blind_us": self.pipeline.datamanager.refractory_us,
             "hot_pixels_left_out": self.pipeline.datamanager.hot_pixels_left_out,
@@ -401,12 +497,15 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Write the checkpoint whole, then remove older ones; the step is the last one done."""
+        """Write the checkpoint whole, then remove all older ones but one; the step is the last one done."""
         path = self._checkpoint_path()
-        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
+        if self.saved_step == self.steps_done and path.is_file():
+            return
+        with self._averaged():
+            pipeline = {name: value.clone() for name, value in self.pipeline.state_dict().items()}
         state = {
             "step": self._last_step(),
-            "pipeline": self.pipeline.state_dict(),
+            "pipeline": pipeline,
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
@@ -414,18 +513,16 @@ class EbarfTrainer(Trainer):
                 "train_seconds": self.train_seconds,
                 "event_pairs": self.event_pairs,
                 "skipped_steps": self.optimizers.skipped,
+                "usual_gradients": self.optimizers.usual,
                 # Those of the pipeline are the mean: what everybody but a resumed training is after.
                 "trained": [parameter.detach().clone() for parameter in self._parameters()],
             },
         }
-        # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
-        with whole_file(self.base_dir / path.name) as temporary, self._averaged():
-            torch.save(state, temporary)
-        (self.base_dir / path.name).replace(path)
-        if self.config.save_only_latest_checkpoint:
-            for old in self.checkpoint_dir.glob("step-*.ckpt"):
-                if old != path:
-                    old.unlink()
+        if name := not_finite(state):
+            CONSOLE.print(f"no checkpoint of step {self.steps_done}, which is not finite in {name}: older ones stay")
+            return
+        write_checkpoint(state, path)
+        self.saved_step = self.steps_done
 
     def _last_step(self) -> int:
         return max(self.steps_done - 1, 0)
@@ -434,38 +531,61 @@ class EbarfTrainer(Trainer):
         return self.checkpoint_dir / f"step-{self._last_step():09d}.ckpt"
 
     def _load_checkpoint(self) -> None:
-        path = self._loaded_path()
+        path = self._loaded_path
+        if path is None:
+            return
+        state = read_checkpoint(path)
+        ours = state.get("ebarf", {})
         try:
-            super()._load_checkpoint()
-        except (RuntimeError, LookupError, TypeError, ValueError, EOFError, UnpicklingError) as error:
-            # Of what is no pickle, torch says how to be less careful with it.
-            unreadable = isinstance(error, (UnpicklingError, EOFError, TypeError, IndexError)) or not str(error)
-            said = "it is no checkpoint" if unreadable else str(error).splitlines()[-1].strip()
-            expected = "expected a run's checkpoint, with the flags it was made by"
-            raise TrainingError(f"{path}: cannot go on from it ({said}), {expected}") from None
-        if path is not None:
-            state = torch.load(path, map_location="cpu")
-            ours = state.get("ebarf", {})
-            self.train_seconds = ours.get("train_seconds", 0.0)
-            self.event_pairs = ours.get("event_pairs", 0)
-            self.optimizers.skipped = ours.get("skipped_steps", 0)
-            self.steps_done = self._start_step
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
             self.mean = [parameter.detach().clone() for parameter in self._parameters()]
             self._put(ours.get("trained", self.mean))
+            self.optimizers.load_optimizers(state["optimizers"])
+            if self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        except (RuntimeError, LookupError, TypeError, ValueError) as error:
+            said = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
+            expected = "expected a run's checkpoint, with the flags it was made by"
+            raise TrainingError(f"{path}: cannot go on from it ({said}), {expected}") from None
+        self._start_step = self.steps_done = state["step"] + 1
+        self.train_seconds = ours.get("train_seconds", 0.0)
+        self.event_pairs = ours.get("event_pairs", 0)
+        self.optimizers.skipped = ours.get("skipped_steps", 0)
+        self.optimizers.usual = ours.get("usual_gradients")
+        CONSOLE.print(f"goes on from {path}")
 
+    @cached_property
     def _loaded_path(self) -> Path | None:
-        if self.config.load_dir is not None:
-            steps = sorted(self.config.load_dir.glob("step-*.ckpt"))
-            step = self.config.load_step
-            if step is None and not steps:
-                raise TrainingError(f"{self.config.load_dir}: holds no step-*.ckpt, expected a run's checkpoints")
-            path = self.config.load_dir / f"step-{step:09d}.ckpt" if step is not None else steps[-1]
-        else:
+        if self.config.load_dir is None:
             path = self.config.load_checkpoint
+        elif self.config.load_step is not None:
+            path = self.config.load_dir / f"step-{self.config.load_step:09d}.ckpt"
+        else:
+            path, damaged = newest_whole(self.config.load_dir)
+            for error in damaged:
+                CONSOLE.print(f"{error}; goes on from {path.name}")
         if path is not None and not path.is_file():
             raise TrainingError(f"{path}: is no file, expected a run's checkpoint")
         return path
 
 
+def scene_digest(scene: Scene) -> dict[str, str]:
+    """What tells whether a scene is still the same, part by part; of the events, their size and a sample of them."""
+    events = sha256(str(scene.events.stat().st_size).encode())
+    with scene.events.open("rb") as file:
+        for k in range(_SAMPLES_OF_EVENTS):
+            file.seek(k * scene.events.stat().st_size // _SAMPLES_OF_EVENTS)
+            events.update(file.read(4096))
+    small = {"scene.json": scene.folder / "scene.json", "trajectory": scene.trajectory}
+    digests = {part: _digest(path.read_bytes()) for part, path in small.items()}
+    return {**digests, "events": events.hexdigest()[:16]}
+
+
 def _digest(content: bytes) -> str:
     return sha256(content).hexdigest()[:16]
+
+
+def _named(value: object) -> str:
+    """Of classes and functions, whose text may hold an address."""
+    return getattr(value, "__qualname__", None) or str(value)

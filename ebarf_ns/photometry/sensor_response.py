@@ -53,8 +53,9 @@ class SensorResponse(nn.Module):
         else:
             self.register_buffer("time_constant", start)
         self.time_constant: Tensor
-        self.register_buffer("mean_brightness", torch.tensor(torch.nan))
-        self.mean_brightness: Tensor
+        # A running sum and its weight: the mean is known as soon as there is anything to take it of.
+        self.register_buffer("seen_brightness", torch.zeros(2))
+        self.seen_brightness: Tensor
 
     @property
     def learns_ratio(self) -> bool:
@@ -71,11 +72,14 @@ class SensorResponse(nn.Module):
 
     def begin_step(self, step: int) -> None:
         """Let the time constant learn in every eighth step, from 0 up: its gradient takes that of all rays."""
-        if self.learns_time_constant:
+        if not self.learns_time_constant:
+            return
+        learns = step % _LEARN_EVERY == 0
+        if learns:
             # Not where it is used: there, at 0, a clamp has no gradient.
             with torch.no_grad():
                 self.time_constant.clamp_(min=0)
-            self.time_constant.requires_grad_(step % _LEARN_EVERY == 0)
+        self.time_constant.requires_grad_(learns)
 
     @property
     def time_constant_us(self) -> Tensor:
@@ -92,9 +96,11 @@ class SensorResponse(nn.Module):
 
         At most 8 times that at the mean brightness: the dark current keeps pixels from becoming ever slower.
         """
-        mean = torch.where(self.mean_brightness.isnan(), brightness.mean(), self.mean_brightness)
+        here = torch.stack([brightness.mean(), torch.ones_like(self.seen_brightness[1])])
+        seen = self.seen_brightness.lerp(here, _LEVEL_SHARE)
         if self.training:
-            self.mean_brightness.copy_(mean.lerp(brightness.mean(), _LEVEL_SHARE))
+            self.seen_brightness.copy_(torch.where(here.isfinite().all(), seen, self.seen_brightness))
+        mean = seen[0] / seen[1]
         slower = (mean - brightness).exp().clamp(max=_SLOWEST)
         return self.time_constant_us * slower
 

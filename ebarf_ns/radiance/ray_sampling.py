@@ -90,7 +90,9 @@ class DensityGrid(nn.Module):
         index = torch.stack([cell % self.cells, cell // self.cells % self.cells, cell // self.cells**2], dim=-1)
         jitter = torch.rand(index.shape, generator=generator).to(index.device)
         unit = (index + jitter) / self.cells
-        self.density[cell] = torch.maximum(0.7 * self.density[cell], field.density_in_unit_cube(unit))
+        found = field.density_in_unit_cube(unit)
+        # A density that is not finite would be remembered for ever.
+        self.density[cell] = torch.maximum(0.7 * self.density[cell], found.where(found.isfinite(), 0.0))
 
     @torch.no_grad()
     def remember(self, point: Float[Tensor, "points 3"], density: Float[Tensor, "points"]) -> None:
@@ -99,7 +101,8 @@ class DensityGrid(nn.Module):
         piece = max(len(point), 1) if point.is_cuda else _IN_ORDER
         cells, densities = self._cell(point).split(piece), density.to(self.density).split(piece)
         for cell, seen in zip(cells, densities, strict=True):
-            self.density[cell] = self.density[cell].lerp(seen, _SHARE_OF_SEEN)
+            known = self.density[cell]
+            self.density[cell] = known.lerp(seen.where(seen.isfinite(), known), _SHARE_OF_SEEN)
 
     def lookup(self, point: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """The remembered density."""

@@ -12,7 +12,7 @@ import torch
 
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf import method
-from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig, GuardedOptimizers
+from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig, FusedAdamConfig, GuardedOptimizers
 from ebarf_ns.simulation.sensor import SensorModel
 from ebarf_ns.simulation.simulate import Simulation, simulate
 
@@ -49,14 +49,16 @@ def trainer(made: EbarfTrainerConfig) -> EbarfTrainer:
 
 def state(ready: EbarfTrainer) -> dict[str, torch.Tensor]:
     """Everything a checkpoint holds of the pipeline but what it cost."""
-    return {name: value.clone() for name, value in ready.pipeline.state_dict().items() if name != "cost"}
+    return {
+        name: value.clone() for name, value in ready.pipeline.state_dict().items() if name not in ("cost", "checksum")
+    }
 
 
 def saved(ready: EbarfTrainer) -> dict[str, torch.Tensor]:
     """The same of its one checkpoint."""
     (path,) = ready.checkpoint_dir.iterdir()
     kept = torch.load(path, weights_only=True)["pipeline"]
-    return {name: value for name, value in kept.items() if name != "cost"}
+    return {name: value for name, value in kept.items() if name not in ("cost", "checksum")}
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -187,9 +189,19 @@ def test_a_used_up_budget_is_said_in_one_line(tiny_scene: Path, tmp_path: Path, 
     assert stopped.value.code == 2 and "has used its budget (12 steps" in capsys.readouterr().err
 
 
-def test_training_twice_into_one_folder_leaves_one_record(tiny_scene: Path, tmp_path: Path):
-    for _ in range(2):
-        trainer(config(tiny_scene, tmp_path, steps=4)).train()
+def test_a_run_is_begun_anew_in_its_folder_only_when_told_so_and_leaves_one_record(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    made = config(tiny_scene, tmp_path, steps=4)
+    trainer(made).train()
+    before = (tmp_path / "x" / "ebarf" / "run" / "metrics.jsonl").read_bytes()
+    with pytest.raises(SystemExit) as stopped:
+        trainer(config(tiny_scene, tmp_path, steps=4))
+    assert stopped.value.code == 2 and "holds a run, up to step-000000003.ckpt; expected" in capsys.readouterr().err
+    assert (tmp_path / "x" / "ebarf" / "run" / "metrics.jsonl").read_bytes() == before
+    made.overwrite, made.max_num_iterations = True, 2
+    trainer(made).train()
+    assert [path.name for path in (made.get_checkpoint_dir()).iterdir()] == ["step-000000001.ckpt"]
     lines = [json.loads(line) for line in (tmp_path / "x" / "ebarf" / "run" / "metrics.jsonl").read_text().splitlines()]
     assert ["versions" in line for line in lines] == [True, False, False]
 
@@ -217,7 +229,7 @@ def test_no_budget_is_an_error(
     assert f"--{flag.replace('_', '-')} is {value}, expected more than 0" in capsys.readouterr().err
 
 
-def test_the_newest_checkpoint_replaces_the_older_and_loads_without_pickled_code(tiny_scene: Path, tmp_path: Path):
+def test_a_checkpoint_loads_without_pickled_code(tiny_scene: Path, tmp_path: Path):
     ready = trainer(config(tiny_scene, tmp_path))
     ready.train()
     (path,) = ready.checkpoint_dir.iterdir()
@@ -373,7 +385,32 @@ def test_what_cannot_be_gone_on_from_ends_in_one_line(
         trainer(made)
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1
-    assert f"{path.name}: cannot go on from it" in said and "with the flags it was made by" in said
+    if what == "of other flags":
+        assert f"{path.name}: cannot go on from it" in said and "with the flags it was made by" in said
+    else:
+        assert f"{path.name}: is damaged, or no checkpoint" in said
+
+
+def test_a_gradient_beyond_reason_is_skipped_unless_it_stays_so():
+    parameter = torch.nn.Parameter(torch.zeros(5))
+    optimizers = GuardedOptimizers(
+        {"x": {"optimizer": FusedAdamConfig(lr=0.01), "scheduler": None}}, {"x": [parameter]}
+    )
+    scaler = torch.amp.GradScaler(enabled=False)
+
+    def step(size: float) -> int:
+        before = optimizers.skipped
+        parameter.grad = torch.full((5,), size)
+        optimizers.optimizer_scaler_step_some(scaler, ["x"])
+        return optimizers.skipped - before
+
+    assert not any(step(1.0) for _ in range(30))
+    moments = {name: value.clone() for name, value in optimizers.optimizers["x"].state[parameter].items()}
+    assert step(1e25) and step(torch.inf) == 1 and not step(2.0)
+    assert step(1e6) and not step(0.5)
+    after = optimizers.optimizers["x"].state[parameter]
+    assert after["step"] == moments["step"] + 2 and float(after["exp_avg_sq"].max()) < 5
+    assert [step(1e6) for _ in range(4)] == [1, 1, 0, 0]
 
 
 def test_a_step_in_which_no_group_is_due_is_not_a_broken_one():

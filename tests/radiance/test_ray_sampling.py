@@ -191,3 +191,18 @@ def test_no_rays_are_no_samples():
     rays, grid = Rays(torch.zeros(0, 3), torch.zeros(0, 3)), DensityGrid(16, bounded=True)
     for place in (importance_edges, ray_sampling_numba.importance_edges):
         assert place(grid, rays, 0.05, torch.zeros(0), 64, 0.1, 0.3, 24, torch.zeros(0, 1), False).shape == (0, 25)
+
+
+def test_a_density_that_is_not_finite_is_not_remembered():
+    grid = DensityGrid(8, bounded=True)
+    point = torch.tensor([[0.1, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.6, 0.1, 0.1]])
+    grid.remember(point, torch.tensor([torch.nan, torch.inf, 5.0]))
+    assert grid.lookup(point).tolist() == [1.0, 1.0, 3.0]
+
+    class Poisoned:
+        def density_in_unit_cube(self, unit: torch.Tensor) -> torch.Tensor:
+            return torch.full((len(unit),), torch.nan)
+
+    for round_number in range(grid.refresh_share):
+        grid.refresh(Poisoned(), round_number, torch.Generator())  # pyright: ignore[reportArgumentType]
+    assert grid.density.isfinite().all()

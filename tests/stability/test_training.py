@@ -17,6 +17,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from ebarf_ns.errors import TrainingError
 from ebarf_ns.events.recording import Recording, read_recording, write_recording
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
@@ -79,7 +80,7 @@ def test_case_25_a_full_disk_leaves_the_older_checkpoint(
 
     monkeypatch.setattr(torch, "save", fill)
     ready.steps_done = 9
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(TrainingError, match="No space left on device.*; expected room on the disk"):
         ready.save_checkpoint(0)
     assert [path.name for path in ready.checkpoint_dir.iterdir()] == ["step-000000004.ckpt"]
     assert newest_checkpoint(ready.checkpoint_dir)["step"] == 4 and not list(ready.base_dir.glob("*.ckpt"))

@@ -1,0 +1,125 @@
+"""Checkpoints that are always whole and always good: verified before they are written and after they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import torch
+from torch import Tensor
+
+from ebarf_ns.errors import TrainingError
+from ebarf_ns.files import synced, whole_file
+
+FORMAT = 1
+_KEPT = 2
+
+
+def write_checkpoint(state: dict[str, Any], path: Path) -> None:
+    """Write a state of tensors and plain values whole, then remove all checkpoints but the newest two.
+
+    ``state["pipeline"]`` gets a checksum of its own, since nerfstudio's scripts read that part alone. Raises
+    :class:`TrainingError` where the disk does not take it; what was there before stays.
+    """
+    state = {**state, "format": FORMAT, "pipeline": sealed(state["pipeline"])}
+    state["checksum"] = checksum(state)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.parent.parent / path.name
+    try:
+        # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
+        with whole_file(beside) as temporary:
+            torch.save(state, temporary)
+        beside.replace(path)
+    except (OSError, RuntimeError) as error:
+        # Torch wraps what the system says.
+        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
+        raise TrainingError(f"{path}: cannot be written ({said}); expected room on the disk") from None
+    synced(path.parent)
+    for old in sorted(path.parent.glob("step-*.ckpt"))[:-_KEPT]:
+        if old != path:
+            old.unlink()
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The state in a file, as tensors and plain values; raises :class:`TrainingError` where it is not what was written.
+
+    Checkpoints of before there were checksums are taken as they are.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        pipeline, _ = state["pipeline"], int(state["step"])
+    except Exception as error:  # whatever damaged bytes make the unpickler raise
+        raise TrainingError(f"{path}: is damaged, or no checkpoint ({type(error).__name__})") from None
+    if (made := state.get("format", 0)) > FORMAT:
+        raise TrainingError(f"{path}: is of format {made}, expected at most {FORMAT}: a newer ebarf_ns made it")
+    stored = state.pop("checksum", None)
+    if stored is not None and stored != checksum(state):
+        raise TrainingError(f"{path}: is damaged: its checksum is not that of its content")
+    if name := not_finite(pipeline):
+        raise TrainingError(f"{path}: holds values that are not finite, in {name}")
+    return state
+
+
+def newest_whole(folder: Path) -> tuple[Path, list[TrainingError]]:
+    """The newest checkpoint of a folder that can be read, and what is wrong with newer ones.
+
+    Raises :class:`TrainingError` where there is none.
+    """
+    wrong: list[TrainingError] = []
+    for path in sorted(folder.glob("step-*.ckpt"), reverse=True):
+        try:
+            read_checkpoint(path)
+        except TrainingError as error:
+            wrong.append(error)
+        else:
+            return path, wrong
+    raise wrong[0] if wrong else TrainingError(f"{folder}: holds no step-*.ckpt, expected a run's checkpoints")
+
+
+def sealed(pipeline: dict[str, Tensor]) -> dict[str, Tensor]:
+    """A pipeline's state, with its checksum."""
+    return {**pipeline, "checksum": torch.tensor(checksum(pipeline))}
+
+
+def unsealed(pipeline: dict[str, Tensor], what: str) -> dict[str, Tensor]:
+    """A pipeline's state without its checksum, verified; raises :class:`TrainingError` with ``what`` it is of."""
+    state = dict(pipeline)
+    stored = state.pop("checksum", None)
+    if stored is not None and int(stored) != checksum(state):
+        raise TrainingError(f"{what}: is damaged: its checksum is not that of its content; expected a whole checkpoint")
+    if name := not_finite(state):
+        raise TrainingError(f"{what}: holds values that are not finite, in {name}; expected a checkpoint of before")
+    return state
+
+
+def checksum(state: Any) -> int:
+    """CRC-32 of all names, values and tensors of a nested state, in order."""
+    value = 0
+    for leaf in _leaves(state):
+        value = crc32(leaf, value)
+    return value
+
+
+def not_finite(state: Any, name: str = "") -> str:
+    """The name of the first tensor of a nested state that holds NaN or inf; empty where all are finite."""
+    if isinstance(state, Tensor):
+        return "" if not state.is_floating_point() or bool(state.isfinite().all()) else name
+    items = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else ()
+    return next((found for key, one in items if (found := not_finite(one, f"{name}.{key}".lstrip(".")))), "")
+
+
+def _leaves(state: Any) -> Iterator[bytes]:
+    if isinstance(state, Tensor):
+        yield f"{state.dtype}{tuple(state.shape)}".encode()
+        yield state.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+    elif isinstance(state, dict):
+        for key, one in state.items():
+            yield repr(key).encode()
+            yield from _leaves(one)
+    elif isinstance(state, list | tuple):
+        for one in state:
+            yield from _leaves(one)
+    else:
+        yield repr(state).encode()

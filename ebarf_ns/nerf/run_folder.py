@@ -1,0 +1,41 @@
+"""A run's folder has one writer at a time, and a run in it is not begun anew unless told to."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from ebarf_ns.errors import TrainingError
+
+_LOCK = ".lock"
+_LEFT_OVER = re.compile(r"\..+\.\w{8}(\.\w+)?")
+
+
+def take_folder(folder: Path, goes_on: bool, overwrite: bool) -> FileLock:
+    """Lock a run's folder for as long as the lock is held, and remove what a killed writer left half written.
+
+    A training that ``goes_on`` from a checkpoint in the folder keeps it; one that begins there anew must be told to
+    ``overwrite`` it, and then older checkpoints go. Raises :class:`TrainingError`, before anything is changed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / _LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise TrainingError(f"{folder}: another training writes there; expected another --timestamp") from None
+    older = sorted((folder / "nerfstudio_models").glob("step-*.ckpt"))
+    if older and not goes_on:
+        if not overwrite:
+            lock.release()
+            raise TrainingError(
+                f"{folder}: holds a run, up to {older[-1].name}; expected --load-dir {folder / 'nerfstudio_models'} to "
+                "go on with it, --overwrite True to begin anew, or another --timestamp"
+            )
+        for path in older:
+            path.unlink()
+    for path in folder.iterdir():
+        if path.is_file() and _LEFT_OVER.fullmatch(path.name):
+            path.unlink()
+    return lock
