@@ -99,6 +99,7 @@ def test_a_ratio_of_thresholds_stands_where_it_is_stated_and_is_counted_where_it
     assert ratios["wrong"] == 1 and ratios["untold"] == pytest.approx(1.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_time_constant_is_found_where_there_is_one_and_not_where_there_is_none(tmp_path: Path):
     found = {}
     for cutoff_hz in (0.0, 30.0):
