@@ -572,10 +572,11 @@ class EbarfTrainer(Trainer):
 
 def scene_digest(scene: Scene) -> dict[str, str]:
     """What tells whether a scene is still the same, part by part; of the events, their size and a sample of them."""
-    events = sha256(str(scene.events.stat().st_size).encode())
+    size = scene.events.stat().st_size
+    events = sha256(str(size).encode())
     with scene.events.open("rb") as file:
         for k in range(_SAMPLES_OF_EVENTS):
-            file.seek(k * scene.events.stat().st_size // _SAMPLES_OF_EVENTS)
+            file.seek(k * size // _SAMPLES_OF_EVENTS)
             events.update(file.read(4096))
     small = {"scene.json": scene.folder / "scene.json", "trajectory": scene.trajectory}
     digests = {part: _digest(path.read_bytes()) for part, path in small.items()}
