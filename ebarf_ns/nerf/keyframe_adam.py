@@ -36,7 +36,8 @@ class KeyframeAdam(torch.optim.Optimizer):
 
     ``eps`` is the share of a matrix' mean diagonal that is added to each direction's. Inverse roots are computed
     anew for no more than 256 rows and stretches a step, in turn; they do not move until their first. Not ``coupled``,
-    each number is scaled by itself.
+    each number is scaled by itself. With a ``power`` below 1/2, C^(-power), directions that events tell badly move less
+    than those that they tell well.
     """
 
     def __init__(
@@ -47,9 +48,10 @@ class KeyframeAdam(torch.optim.Optimizer):
         eps: float = 1e-3,
         coupled: bool = True,
         stretches: bool = True,
+        power: float = 0.5,
     ):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
-        self.coupled, self.stretches = coupled, stretches
+        self.coupled, self.stretches, self.power = coupled, stretches, power
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -76,7 +78,7 @@ class KeyframeAdam(torch.optim.Optimizer):
         outer.lerp_(gradient[:, :, None] * gradient[:, None, :], 1 - beta2)
         due = (step * _ROOTS_A_STEP + torch.arange(min(count, _ROOTS_A_STEP), device=rows.device)) % count
         seen = outer[due] if self.coupled else outer[due] * torch.eye(dim).to(outer)
-        root[due] = _inverse_root(seen / (1 - beta2 ** (step + 1)), eps)
+        root[due] = _inverse_power(seen / (1 - beta2 ** (step + 1)), eps, self.power)
         state["step"] = step + 1
         direction = (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
         return direction if onto_rows is None else onto_rows @ direction
@@ -114,10 +116,10 @@ def _as_tensor(sparse: csr_matrix, device: torch.device, dtype: torch.dtype) -> 
         return torch.sparse_csr_tensor(*parts, size=sparse.shape, dtype=dtype, device=device, check_invariants=True)
 
 
-def _inverse_root(outer: Float[Tensor, "rows dim dim"], eps: float) -> Float[Tensor, "rows dim dim"]:
-    """(C + eps times its mean diagonal)^(-1/2); 0 where C is 0."""
+def _inverse_power(outer: Float[Tensor, "rows dim dim"], eps: float, power: float) -> Float[Tensor, "rows dim dim"]:
+    """(C + eps times its mean diagonal)^-power, for C of mean diagonal 1, and C^(-1/2) in its scale; 0 where C is 0."""
     size = outer.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     safe = torch.where(size > 0, size, torch.ones_like(size))[:, None, None]
     spread, direction = torch.linalg.eigh(outer / safe)
     scale = torch.where(size > 0, safe[:, 0, 0].rsqrt(), torch.zeros_like(size))[:, None, None]
-    return scale * direction @ ((spread.clamp_min(0) + eps).rsqrt()[..., None] * direction.mT)
+    return scale * direction @ ((spread.clamp_min(0) + eps).pow(-power)[..., None] * direction.mT)

@@ -56,7 +56,13 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
     """The seed paper's method; its baseline is the same with the poses frozen."""
     model = EbarfModelConfig(
         camera_optimizer=TrajectoryOptimizerConfig(
-            mode=mode, smooth=False, keyframe_stride=1, prior=0.0, every=1, interpolation="linear"
+            mode=mode,
+            smooth=False,
+            align_steps=0,
+            keyframe_stride=1,
+            prior=0.0,
+            every=1,
+            interpolation="linear",
         ),
         loss="normalized",
         outliers_from=None,

@@ -34,6 +34,7 @@ from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
+from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.checkpoints import newest_whole, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.nerf.pipeline import EbarfPipeline
@@ -45,6 +46,7 @@ from ebarf_ns.scene import Scene, check_bounds, read_scene
 _SKIPPED_IN_A_ROW, _BELIEVED = 10, 2
 _KNOWN, _BEYOND_REASON = 20, 1e4
 _SAMPLES_OF_EVENTS = 64
+_ALIGNMENT_SHARE = 0.35
 _LEAST = {
     "machine.seed": 0,
     "pipeline.datamanager.train_num_rays_per_batch": 2,
@@ -78,6 +80,7 @@ _LEAST = {
     "pipeline.model.camera_optimizer.keyframe_stride": 1,
     "pipeline.model.camera_optimizer.prior": 0,
     "pipeline.model.camera_optimizer.every": 1,
+    "pipeline.model.camera_optimizer.align_steps": 0,
     "averaged_steps": 1,
 }
 
@@ -211,6 +214,7 @@ class EbarfTrainer(Trainer):
         self.evaluated_step = self.saved_step = 0
         self.last_loss = math.nan
         self.signal = 0
+        self.alignment: Alignment | None = None
         self.mean: list[Tensor] | None = None
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
@@ -223,6 +227,7 @@ class EbarfTrainer(Trainer):
             try:
                 self._plan()
                 super().setup(test_mode)
+                self._align()
                 if self.progress() >= 1:
                     raise TrainingError(
                         f"the loaded run has used its budget ({self.steps_done} steps, {self.train_seconds:.0f} s); "
@@ -274,6 +279,23 @@ class EbarfTrainer(Trainer):
         lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized, facts)
         self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
         self._keep_plan()
+
+    def _align(self) -> None:
+        """Look for large errors of the trajectory, where a run begins and its budget allows for it."""
+        model, config = self.pipeline.model, self.config
+        settings, seconds = model.config.camera_optimizer, config.max_train_seconds
+        steps = min(settings.align_steps, int(_ALIGNMENT_SHARE * config.max_num_iterations))
+        # Too few steps find nothing, and say so of any trajectory.
+        if self._loaded_path or settings.mode == "off" or not steps or steps < settings.align_steps:
+            return
+        most_seconds = seconds and _ALIGNMENT_SHARE * seconds
+        started = monotonic()
+        self.alignment = align(model, self.pipeline.datamanager, steps, config.machine.seed, most_seconds)
+        if self.world_size > 1:
+            for start in (model.camera_optimizer.start_position, model.camera_optimizer.start_quat_wxyz):
+                torch.distributed.broadcast(start, 0)
+        self.train_seconds = self._agreed(monotonic() - started)
+        CONSOLE.print(str(self.alignment or "no large error of the trajectory was looked for in this budget"))
 
     def _lines_of_resumed_run(self, lines: list[Line]) -> list[Line]:
         """The plan that a loaded checkpoint was made by, whatever would be planned on this machine today."""
@@ -492,6 +514,7 @@ class EbarfTrainer(Trainer):
             "hash_grid": fastest_carrier(torch.zeros(0, 3, device=self.device)),
             "blind_us": self.pipeline.datamanager.refractory_us,
             "hot_pixels_left_out": self.pipeline.datamanager.hot_pixels_left_out,
+            "alignment": asdict(self.alignment) if self.alignment else None,
             "plan": {line.field: {"value": line.value, "reason": line.reason} for line in self.plan},
         }
 

@@ -32,6 +32,8 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     rot_l2_penalty: tyro.conf.Suppress[float] = 0.0
     smooth: bool = True
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
+    align_steps: int = 400
+    """Before training, look for large errors in so many steps of a coarse field; 0: do not."""
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
     prior: float = 0.01
@@ -70,6 +72,8 @@ class TrajectoryOptimizer(CameraOptimizer):
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
         self.pixel_rad = 1 / focal_px
+        self.translation_px = 1.0
+        """Pixels at unit distance that a translation by one moves the image."""
         self.register_buffer("keyframe_t_us", keyframes.t_us.clone())
         self.register_buffer("initial_position", keyframes.poses.position.clone())
         self.register_buffer("initial_quat_wxyz", keyframes.poses.quat_wxyz.clone())
@@ -81,7 +85,6 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
         self.start_position: Tensor
         self.start_quat_wxyz: Tensor
-        self.smoothed_px2 = _mean_squared_distance(keyframes.poses, start) / self.pixel_rad**2
         knots = _every(config.keyframe_stride or 1, len(keyframes.t_us))
         # Between which knots each keyframe lies never changes.
         left, fraction = intervals(keyframes.t_us[knots], keyframes.t_us)
@@ -98,20 +101,30 @@ class TrajectoryOptimizer(CameraOptimizer):
             every = self.config.every ** (1 if step < _SETTLED_STEP else 2)
             self.correction.requires_grad_(step % every == 0)
 
+    def begin_from(self, start: Poses) -> None:
+        """Correct these keyframes from now on."""
+        self.start_position.copy_(start.position)
+        self.start_quat_wxyz.copy_(start.quat_wxyz)
+
     def initial(self) -> Poses:
         """The keyframes as they came."""
         return Poses(self.initial_position, self.initial_quat_wxyz)
 
     def keyframes(self) -> Poses:
         """The keyframes as corrected so far."""
-        start = Poses(self.start_position, self.start_quat_wxyz)
+        start = self._start()
         if self.config.mode == "off":
             return start
         correction = self.correction
         if len(correction) < len(self.keyframe_t_us):
             left, right = correction[self.left_knot], correction[self.left_knot + 1]
             correction = torch.lerp(left, right, self.way_to_next_knot.to(correction))
+        if self.translation_px != 1:
+            correction = correction * correction.new_tensor([1.0] * 3 + [self.translation_px] * 3)
         return corrected(start, self.pixel_rad * correction)
+
+    def _start(self) -> Poses:
+        return Poses(self.start_position, self.start_quat_wxyz)
 
     def trajectory(self) -> Trajectory:
         """The corrected keyframes and their times, detached."""
@@ -122,6 +135,10 @@ class TrajectoryOptimizer(CameraOptimizer):
         """Corrected poses at given times, or as much earlier as ``delay_us`` says."""
         kind = self.config.interpolation or "linear"
         return interpolate(self.keyframe_t_us, self.keyframes(), t_us, kind, delay_us)
+
+    def start_at(self, t_us: Int[Tensor, "*batch"]) -> Poses:
+        """Where training began from, at given times."""
+        return interpolate(self.keyframe_t_us, self._start(), t_us, self.config.interpolation or "linear")
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Turn event rays, given in the camera's frame at their time, into world rays; others already are."""
@@ -161,12 +178,14 @@ class TrajectoryOptimizer(CameraOptimizer):
     def get_loss_dict(self, loss_dict: dict) -> None:
         """Adds what speaks for the trajectory as it came: it is good to a fraction of a pixel, or nobody knows how bad.
 
-        Keyframes that are off by a mean square of m pixels, by smoothing and by corrections, cost m / (m + 0.4²) times
-        the prior (Geman and McClure, 1987). A good trajectory stays where a field that is yet to take shape would bend
-        it, and the more so as the events' own loss falls; nothing draws one back that was noisy, or drifted by pixels.
+        Keyframes that are off by a mean square of m pixels, by where training began and by corrections, cost
+        m / (m + 0.4²) times the prior (Geman and McClure, 1987). A good trajectory stays where a field that is yet to
+        take shape would bend it, and the more so as the events' own loss falls; nothing draws one back that was noisy,
+        or drifted by pixels.
         """
         if self.config.mode == "refine" and self.config.prior:
-            off_px2 = self.smoothed_px2 + self.correction.square().sum(dim=-1).mean()
+            before_px2 = _mean_squared_distance(self.initial(), self._start()) / self.pixel_rad**2
+            off_px2 = before_px2 + self.correction.square().sum(dim=-1).mean()
             loss_dict["trajectory_prior"] = self.config.prior * off_px2 / (off_px2 + _GOOD_PX**2)
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
@@ -181,10 +200,10 @@ class TrajectoryOptimizer(CameraOptimizer):
             param_groups["camera_opt"] = [self.correction]
 
 
-def _mean_squared_distance(some: Poses, others: Poses) -> float:
+def _mean_squared_distance(some: Poses, others: Poses) -> Float[Tensor, ""]:
     """Mean squared distance of poses: of rotations in radians, and of positions."""
     rotation = turn_between(some.quat_wxyz, others.quat_wxyz)
-    return float((rotation.square() + (some.position - others.position).square()).sum(dim=-1).mean())
+    return (rotation.square() + (some.position - others.position).square()).sum(dim=-1).mean()
 
 
 def _every(stride: int, count: int) -> Int[Tensor, "knots"]:

@@ -87,6 +87,8 @@ class HashGrid(nn.Module):
         super().__init__()
         self.shape = shape
         self.carrier: Carrier | None = carrier
+        self.level_shares: Tensor | None = None
+        """Factors of the levels' features; None: all of them as they are."""
         self.lattice = Lattice(shape)
         # By numpy, which asks for large pages.
         self.table = nn.Parameter(torch.from_numpy(np.empty((sum(shape.rows), shape.features), np.float32)))
@@ -94,6 +96,12 @@ class HashGrid(nn.Module):
 
     def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
         """Features of points in [0, 1]³ (points outside are moved to the nearest face)."""
+        features = self._encode(point)
+        if self.level_shares is None:
+            return features
+        return features * self.level_shares.repeat_interleave(self.shape.features)
+
+    def _encode(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
         carrier = self.carrier or fastest_carrier(point)
         if carrier == "numba":
             from ebarf_ns.radiance.hash_grid_numba import encode
