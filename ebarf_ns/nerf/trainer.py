@@ -46,7 +46,7 @@ from ebarf_ns.scene import Scene, check_bounds, read_scene
 _SKIPPED_IN_A_ROW, _BELIEVED = 10, 2
 _KNOWN, _BEYOND_REASON = 20, 1e4
 _SAMPLES_OF_EVENTS = 64
-_ALIGNMENT_SHARE = 0.35
+_ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
 _LEAST = {
     "machine.seed": 0,
     "pipeline.datamanager.train_num_rays_per_batch": 2,
@@ -286,7 +286,8 @@ class EbarfTrainer(Trainer):
         settings, seconds = model.config.camera_optimizer, config.max_train_seconds
         steps = min(settings.align_steps, int(_ALIGNMENT_SHARE * config.max_num_iterations))
         # Too few steps find nothing, and say so of any trajectory.
-        if self._loaded_path or settings.mode == "off" or not steps or steps < settings.align_steps:
+        too_little = steps < settings.align_steps or (seconds is not None and seconds < _ALIGNMENT_SECONDS)
+        if self._loaded_path or settings.mode == "off" or not steps or too_little:
             return
         most_seconds = seconds and _ALIGNMENT_SHARE * seconds
         started = monotonic()
