@@ -16,7 +16,7 @@ import torch
 
 from ebarf_ns.events.sensor_facts import UNKNOWN_SENSOR, SensorFacts
 from ebarf_ns.geometry.so3 import rotate, turn_between
-from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate
+from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, densified, interpolate
 from ebarf_ns.radiance.field import fastest_precision
 from ebarf_ns.radiance.ray_sampling import Rays, leave_box
 from ebarf_ns.scene import box_of_bounds
@@ -31,6 +31,8 @@ _GROWTH = 1.6
 _STRAIGHT_PX = 0.05
 _AS_GOOD_AS_STRAIGHT_PX = 0.02
 _UNEVEN = 4.0
+_BETWEEN_PX = 0.05
+_SHORTEST_GAP_US = 45_000
 _MOST_BLANK = 0.06
 
 
@@ -74,7 +76,11 @@ def plan_for(
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
+    gap_us, gaps = _longest_gap(trajectory, scene.camera.fx, distance)
+    dense, _ = densified(trajectory, gap_us, _spline_if_even(trajectory))
     stride, straight = _stride(trajectory, scene.camera.fx, distance)
+    if len(dense.t_us) > len(trajectory.t_us):
+        stride, straight = 1, "keyframes are inserted: each is learned"
     precision = fastest_precision(device)
     rays = 16384 if device == "cuda" else 1024
     return [
@@ -112,6 +118,7 @@ def plan_for(
             precision,
             "this processor multiplies bfloat16 natively" if precision == "bfloat16" else "no native bfloat16 here",
         ),
+        Line("pipeline.model.camera_optimizer.longest_gap_us", gap_us, gaps),
         Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
         Line("pipeline.model.camera_optimizer.interpolation", *_interpolation(trajectory, scene.camera.fx, distance)),
         Line(
@@ -236,7 +243,7 @@ def _stride(trajectory: Trajectory, focal_px: float, distance: float | None) -> 
     keyframes = len(trajectory.t_us)
     stride, off_px = 1, 0.0
     while 2 * stride * 4 <= keyframes:
-        wider = _off_straight_px(trajectory, 2 * stride, focal_px, distance)
+        wider = _off_px(trajectory, 2 * stride, focal_px, distance)
         if wider > _STRAIGHT_PX:
             break
         stride, off_px = 2 * stride, wider
@@ -248,28 +255,59 @@ def _stride(trajectory: Trajectory, focal_px: float, distance: float | None) -> 
     return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
 
 
+def _longest_gap(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
+    """How far apart keyframes may be, in microseconds; 0: as far as they are."""
+    gaps_us = trajectory.t_us.diff()
+    usual_us, longest_us = int(gaps_us.median()), int(gaps_us.max())
+    kind = _spline_if_even(trajectory)
+    # Halving the distance between knots leaves a quarter of what is not straight, and an eighth at most of what no
+    # spline follows.
+    shrinks = 8 if kind == "cubic" else 4
+    off_px = _off_px(trajectory, 2, focal_px, distance, kind) / shrinks
+    pieces, left_px = 1, off_px
+    while left_px > _BETWEEN_PX and usual_us // (2 * pieces) >= _SHORTEST_GAP_US:
+        pieces, left_px = 2 * pieces, left_px / shrinks
+    gap_us = max(usual_us // pieces, _SHORTEST_GAP_US)
+    if pieces == 1 and longest_us < 2 * gap_us:
+        return 0, f"between keyframes the motion is known to {off_px:.2g} px"
+    if pieces == 1:
+        return gap_us, f"gaps of up to {longest_us} us between keyframes that are {usual_us} us apart as a rule"
+    return gap_us, f"between keyframes, {usual_us} us apart, the motion is unknown by {off_px:.2g} px"
+
+
+def _unevenness(trajectory: Trajectory) -> float:
+    gaps_us = trajectory.t_us.diff().double()
+    return float(gaps_us.max() / gaps_us.min())
+
+
+def _spline_if_even(trajectory: Trajectory) -> Interpolation:
+    return "linear" if len(trajectory.t_us) < 5 or _unevenness(trajectory) > _UNEVEN else "cubic"
+
+
 def _interpolation(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[Interpolation, str]:
     """A spline where the motion between keyframes is no straight line, if they are spaced evenly enough for one."""
     keyframes = len(trajectory.t_us)
-    gaps_us = trajectory.t_us.diff().double()
-    uneven = float(gaps_us.max() / gaps_us.min())
-    if keyframes < 5 or uneven > _UNEVEN:
+    if _spline_if_even(trajectory) == "linear":
+        uneven = _unevenness(trajectory)
         return "linear", f"{keyframes} keyframes, gaps between them up to {uneven:.3g} times the shortest: no spline"
     # Halving the distance between knots leaves a quarter of what is not straight.
-    off_px = _off_straight_px(trajectory, 2, focal_px, distance) / 4
+    off_px = _off_px(trajectory, 2, focal_px, distance) / 4
     if off_px < _AS_GOOD_AS_STRAIGHT_PX:
         return "linear", f"between keyframes the motion is straight to {off_px:.2g} px"
     return "cubic", f"between keyframes the motion is off a straight line by {off_px:.2g} px"
 
 
-def _off_straight_px(trajectory: Trajectory, stride: int, focal_px: float, distance: float | None) -> float:
-    """How far keyframes are from the straight line between each ``stride``-th, root mean square, in pixels.
+def _off_px(
+    trajectory: Trajectory, stride: int, focal_px: float, distance: float | None, kind: Interpolation = "linear"
+) -> float:
+    """How far keyframes are from what each ``stride``-th of them would say, root mean square, in pixels.
 
     Without a known distance, four times the trajectory's radius stands for it.
     """
     knots = torch.arange(0, len(trajectory.t_us) - 1, stride)
     knots = torch.cat([knots, torch.tensor([len(trajectory.t_us) - 1])])
-    line = interpolate(trajectory.t_us[knots], Poses(*(column[knots] for column in trajectory.poses)), trajectory.t_us)
+    at_knots = Poses(*(column[knots] for column in trajectory.poses))
+    line = interpolate(trajectory.t_us[knots], at_knots, trajectory.t_us, kind)
     position = trajectory.poses.position
     if distance is None:
         distance = 4 * float((position - position.mean(dim=0)).norm(dim=-1).max())

@@ -168,6 +168,11 @@ def _relative(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.resolve().as_posix()
 
 
+def write_camera(path: Path, camera: Camera) -> None:
+    """Write a camera as ``scene.json`` has it under "camera"."""
+    _write_json(path, _camera_json(camera))
+
+
 def _camera_json(camera: Camera) -> dict[str, Any]:
     return {**vars(camera), "distortion": list(camera.distortion)}
 

@@ -407,6 +407,14 @@ class HeldoutBlocks:
         phase = (t_us - self.start_us) / max(self.end_us - self.start_us, 1) * self.blocks % 1
         return np.abs(phase - 0.5) < self.share / 2
 
+    def middle_s(self, number: int) -> float:
+        """The middle of a window, in seconds."""
+        return round((self.start_us + (number + 0.5) * (self.end_us - self.start_us) / self.blocks) * 1e-6, 3)
+
+    def number(self, t_us: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
+        """In or nearest to which window each time lies."""
+        return ((t_us - self.start_us) * self.blocks // max(self.end_us - self.start_us, 1)).clip(0, self.blocks - 1)
+
     def training(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
         """Pairs that begin and end outside; their sums count the events in between all the same."""
         return ~(self.contain(pairs.t0_us) | self.contain(pairs.t1_us))

@@ -9,6 +9,9 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
     from jaxtyping import Float
 
 CameraModel = Literal["pinhole", "radtan", "equidistant"]
@@ -50,10 +53,10 @@ class Camera:
         """Pixel coordinates of points in the camera frame (z > 0), float64."""
         plane = point.double()[..., :2] / point.double()[..., 2:]
         if self.model == "radtan":
-            plane = _distort_radtan(plane, self.distortion)
+            plane = distort_radtan(plane, self.distortion)
         if self.model == "equidistant":
             radius = plane.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-            plane = plane / radius * _equidistant_radius(radius.atan(), self.distortion)
+            plane = plane / radius * equidistant_radius(radius.atan(), self.distortion)
         return plane * self._focal + self._centre
 
     @property
@@ -65,7 +68,8 @@ class Camera:
         return torch.tensor([self.cx, self.cy], dtype=torch.float64)
 
 
-def _distort_radtan(plane: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+def distort_radtan(plane: Float[Tensor, "*batch 2"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch 2"]:
+    """Brown's model: (k1, k2, p1, p2[, k3]), numbers or tensors, of points at distance 1."""
     k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
     x, y = plane.unbind(-1)
     r2 = x * x + y * y
@@ -85,13 +89,14 @@ def _undistort_radtan(distorted: Tensor, coefficients: tuple[float, ...], iterat
     for _ in range(iterations):
         with torch.enable_grad():
             point = plane.detach().requires_grad_()
-            image = _distort_radtan(point, coefficients)
+            image = distort_radtan(point, coefficients)
             rows = [torch.autograd.grad(image[..., i].sum(), point, retain_graph=True)[0] for i in range(2)]
         plane = plane - torch.linalg.solve(torch.stack(rows, dim=-2), image.detach() - distorted)
     return plane
 
 
-def _equidistant_radius(angle_rad: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+def equidistant_radius(angle_rad: Float[Tensor, "*batch"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch"]:
+    """Kannala and Brandt's distance from the centre, for (k1, k2, k3, k4), numbers or tensors."""
     k1, k2, k3, k4 = coefficients
     a2 = angle_rad * angle_rad
     return angle_rad * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
@@ -104,6 +109,6 @@ def _equidistant_bearings(distorted: Tensor, coefficients: tuple[float, ...], it
     for _ in range(iterations):
         a2 = angle_rad * angle_rad
         slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
-        angle_rad = angle_rad - (_equidistant_radius(angle_rad, coefficients) - radius) / slope
+        angle_rad = angle_rad - (equidistant_radius(angle_rad, coefficients) - radius) / slope
     direction = distorted / radius.clamp_min(1e-12)
     return torch.cat([direction * angle_rad.sin(), angle_rad.cos()], dim=-1)

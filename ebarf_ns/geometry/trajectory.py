@@ -58,6 +58,26 @@ def check_keyframes(t_us: Int64[Tensor, "keyframes"]) -> None:
         )
 
 
+def densified(
+    trajectory: Trajectory, longest_gap_us: int, kind: Interpolation
+) -> tuple[Trajectory, Int64[Tensor, "given"]]:
+    """The trajectory with poses inserted, evenly, wherever two are further apart than that; and where those given are.
+
+    0 inserts none.
+    """
+    t_us = trajectory.t_us
+    pieces = -(-t_us.diff() // longest_gap_us) if longest_gap_us else torch.ones_like(t_us[1:])
+    given = torch.nn.functional.pad(pieces.cumsum(0), (1, 0))
+    if int(given[-1]) == len(t_us) - 1:
+        return trajectory, given
+    left = torch.arange(len(pieces)).repeat_interleave(pieces)
+    piece = torch.arange(len(left)) - given[left]
+    inserted_t_us = torch.cat([t_us[left] + t_us.diff()[left] * piece // pieces[left], t_us[-1:]])
+    poses = interpolate(t_us, trajectory.poses, inserted_t_us, kind)
+    poses.position[given], poses.quat_wxyz[given] = trajectory.poses
+    return Trajectory(inserted_t_us, poses), given
+
+
 def corrected(keyframes: Poses, correction: Float[Tensor, "keyframes 6"]) -> Poses:
     """T · (exp(ω), υ): each keyframe moved in its own camera frame by ``correction = (ω [rad], υ [units])``."""
     return keyframes.compose(Poses(correction[..., 3:], quat_wxyz_exp(correction[..., :3])))

@@ -1,5 +1,6 @@
 """Trajectories on disk: TUM text, ``timestamp[s] tx ty tz qx qy qz qw``, one pose a line, ``#`` starts a comment."""
 
+from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -68,9 +69,9 @@ def _parse_pose(place: str, fields: list[str]) -> tuple[int, list[float]]:
     return t_us, row
 
 
-def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write poses as TUM text, times to the microsecond."""
-    lines = ["# timestamp[s] tx ty tz qx qy qz qw"]
+def write_tum(path: Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
+    """Write poses as TUM text, times to the microsecond, below one line for each comment."""
+    lines = [f"# {comment}" for comment in (*comments, "timestamp[s] tx ty tz qx qy qz qw")]
     position, quat_wxyz = trajectory.poses.position.double(), trajectory.poses.quat_wxyz.double()
     for t_us, p, (w, *xyz) in zip(trajectory.t_us.tolist(), position.tolist(), quat_wxyz.tolist(), strict=True):
         numbers = " ".join(f"{value:.9f}" for value in (*p, *xyz, w))

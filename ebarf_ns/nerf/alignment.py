@@ -1,45 +1,47 @@
-"""Before training: large errors of the trajectory, found by a field too coarse to lock them in.
+"""Before training: large errors of the trajectory and of its clock, found by a field too coarse to lock them in.
 
-A fine field explains a drifted trajectory by a scene of its own, and then holds the keyframes where they are. A coarse
-one cannot (coarse to fine, as in Lin et al. 2021, BARF): its finest level begins at 16 pixels and ends at 1.5. What it
-has found is measured as motion of the image. Where that is little, the trajectory was good, and is left alone: the
-coarse field's own errors, a pixel along directions that events hardly tell, would be all that it gets.
+What was found is measured as motion of the image. Where that is little, the trajectory was good, and is left alone:
+the coarse field's own errors, a pixel along directions that events hardly tell, would be all that it gets.
 """
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass
 from time import monotonic
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
+from ebarf_ns.geometry.clock import offset_by_activity
 from ebarf_ns.geometry.so3 import rotate
+from ebarf_ns.nerf.coarse import CoarseTraining, between, coarse_model, gain, heldout_losses, set_rate
 from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.radiance.ray_sampling import Rays
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from nerfstudio.cameras.rays import RayBundle
+    from torch import Tensor
 
     from ebarf_ns.nerf.datamanager import EventDataManager
-    from ebarf_ns.nerf.model import EbarfModel, EbarfModelConfig
-    from ebarf_ns.radiance.hash_grid import HashGrid
+    from ebarf_ns.nerf.model import EbarfModel
 
 # Both runs that drifted by 12 pixels (5 degrees) came back with these.
-_FIRST_PX, _LAST_PX = 16.0, 1.5
-_FIRST_RATE, _LAST_RATE = 0.4, 0.05
-_FIELD_RATE, _FIELD_DECAY = 1e-2, 0.3
-_SAMPLES, _DENSITY_CELLS = 8, 48
-_MOST_KNOTS = 200
+_FIRST_RATE, _LAST_RATE, _POWER = 0.4, 0.05, 0.25
 # Odometry errs by degrees rather than by pixels of translation. What moves the image alike is told apart by this, and
 # by what leaving the trajectory costs a squared pixel: without them, rotation and shift grow together, in opposition.
 _TRANSLATION_PX, _COST = 0.3, 1e-4
+# The same in training, where errors were smooth. Noise on every keyframe is more than that would let go: -0.5 dB.
+_COST_IN_TRAINING, _SMOOTH = 3e-4, 0.06
 _PROBE, _CERTAINLY_GOOD_PX, _GOOD_PX = 200, 1.0, 1.8
 _BATCHES_TO_MEASURE = 2
+_INTRINSICS_ALONE = 0.5
 _WARM_UP = 5
+_CLOCK_EVERY, _LEAST_CLOCK_PX = 100, 0.2
+# What the rate of events says of the clock is looked into when it says a lot.
+_LEAST_ACTIVITY_US, _LEAST_ALIKE, _LEAST_GAIN = 40_000, 0.5, 0.05
+_SOME_BEARINGS = 50
+_CLOCK_STEPS, _CLOCK_DEVIATIONS = 100, 3.0
 
 
 @dataclass(frozen=True)
@@ -50,13 +52,16 @@ class Alignment:
     """Root mean square motion of the image at events, less what moves the whole scene along."""
     taken: bool
     """Whether training begins from the keyframes found."""
+    clock_offset_us: int
+    """What was added to the trajectory's times; 0: they fit the events."""
     steps: int
     seconds: float
 
     def __str__(self) -> str:
+        clock = f"its clock is off by {self.clock_offset_us / 1000:+.1f} ms; " if self.clock_offset_us else ""
         if self.taken:
-            return f"the trajectory is off by {self.moved_px:.1f} px: training begins where a coarse field puts it"
-        return f"the trajectory is off by {self.moved_px:.1f} px or less: training begins from it as it is"
+            return f"the trajectory: {clock}off by {self.moved_px:.1f} px: training begins where a coarse field puts it"
+        return f"the trajectory: {clock}off by {self.moved_px:.1f} px or less: training begins from it as it is"
 
 
 def align(
@@ -64,84 +69,107 @@ def align(
 ) -> Alignment | None:
     """Move the keyframes that ``model`` begins from to where a coarse field puts them, if that is far.
 
-    None, and nothing moved, if that would take more than ``most_seconds`` or ends in numbers that are not finite.
+    Their clock is set by the way, where it was off. None, and nothing moved, if that would take more than
+    ``most_seconds`` or ends in numbers that are not finite.
     """
     started = monotonic()
-    coarse = _coarse_model(model)
-    keyframes, grid = coarse.camera_optimizer, coarse.renderer.field.grid
-    parameters = coarse.get_param_groups()
-    field = torch.optim.Adam(parameters["fields"], lr=_FIELD_RATE, betas=(0.9, 0.99), eps=1e-15, fused=True)
-    poses = KeyframeAdam(parameters["camera_opt"], lr=_FIRST_RATE, power=0.25)
+    _set_clock_by_activity(model, datamanager, seed)
+    coarse = coarse_model(model)
+    keyframes = coarse.camera_optimizer
+    keyframes.hold_to_given(_COST, _TRANSLATION_PX)
+    if keyframes.clock_offset_us:
+        keyframes.learn_clock()
+    moving = [[*keyframes.parameters()], [*coarse.intrinsics.parameters()] if coarse.intrinsics else []]
+    poses = KeyframeAdam([{"params": one} for one in moving if one], lr=_FIRST_RATE, power=_POWER)
+    training = CoarseTraining(coarse, datamanager, steps, seed)
     moved_px, warm = 0.0, started
     for step in range(steps):
-        done = step / steps
-        grid.level_shares = _shares(grid, _LAST_PX / _between(_FIRST_PX, _LAST_PX, done))
-        _set_rate(poses, _between(_FIRST_RATE, _LAST_RATE, done))
-        _set_rate(field, _between(_FIELD_RATE, _FIELD_DECAY * _FIELD_RATE, done))
-        coarse.begin_step(step, seed)
-        rays, batch = datamanager.next_train(step)
-        losses = coarse.get_loss_dict(coarse(rays), batch)
-        loss = torch.stack([*losses.values()]).sum() + _COST * keyframes.correction.square().sum(dim=-1).mean()
-        if not bool(loss.detach().isfinite()):
-            return None
-        for optimizer in (field, poses):
-            optimizer.zero_grad()
-        loss.backward()
-        gradient = keyframes.correction.grad
-        if gradient is None or not bool(gradient.isfinite().all()):
-            return None
-        for optimizer in (field, poses):
-            optimizer.step()
+        set_rate(poses, between(_FIRST_RATE, _LAST_RATE, step / steps))
+        if coarse.intrinsics and step < _INTRINSICS_ALONE * steps:
+            # Together, rotations take on much of what a wrong focal length does to them.
+            poses.param_groups[0]["lr"] = 0.0
+        if not training.step(step, poses):
+            return _nothing_moved(model, datamanager)
         if step == _WARM_UP:
             warm = monotonic()
         elif most_seconds and step == 5 * _WARM_UP and (monotonic() - warm) / (4 * _WARM_UP) * steps > most_seconds:
-            return None
+            return _nothing_moved(model, datamanager)
+        if (step + 1) % _CLOCK_EVERY == 0:
+            offset = keyframes.remaining_clock_offset()
+            matters = offset.moved_rad > _LEAST_CLOCK_PX * keyframes.pixel_rad
+            asked = step + 1 == _PROBE and offset.likely
+            if matters and (offset.certain or (asked and _is_better(model, datamanager, offset.offset_us, seed))):
+                keyframes.explain_by_clock(offset.offset_us)
+                keyframes.learn_clock()
+                datamanager.shift_clock(int(keyframes.clock_offset_us))
+                poses.state.clear()
         if step + 1 in (_PROBE, steps):
             moved_px = _moved_px(coarse, [datamanager.next_train(step + k)[0] for k in range(_BATCHES_TO_MEASURE)])
             if not moved_px < float("inf"):
-                return None
-            if moved_px < _CERTAINLY_GOOD_PX:
+                return _nothing_moved(model, datamanager)
+            if moved_px < _CERTAINLY_GOOD_PX and not coarse.intrinsics:
                 break
     taken = moved_px >= _GOOD_PX
+    _begin(model, coarse, taken)
+    datamanager.shift_clock(int(model.camera_optimizer.clock_offset_us))
+    seconds = round(monotonic() - started, 3)
+    return Alignment(round(moved_px, 3), taken, int(model.camera_optimizer.clock_offset_us), step + 1, seconds)
+
+
+def _set_clock_by_activity(model: EbarfModel, datamanager: EventDataManager, seed: int) -> None:
+    """Set the clock to where the rate of events goes best with the motion, if a field trained there is better, too."""
+    keyframes = model.camera_optimizer
+    some = datamanager.bearings[:: max(1, len(datamanager.bearings) // _SOME_BEARINGS)]
+    kind = keyframes.config.interpolation or "linear"
+    event_t_us = datamanager.index.events["t_us"]
+    offset_us, alike, now = offset_by_activity(event_t_us, keyframes.start_trajectory(), some, kind)
+    says_a_lot = abs(offset_us) >= _LEAST_ACTIVITY_US and alike > _LEAST_ALIKE and alike - now > _LEAST_GAIN
+    if says_a_lot and _is_better(model, datamanager, offset_us, seed):
+        keyframes.shift_clock(offset_us)
+        datamanager.shift_clock(offset_us)
+
+
+def _is_better(model: EbarfModel, datamanager: EventDataManager, offset_us: int, seed: int) -> bool:
+    """Whether a field predicts held-out events better if the clock is shifted, and poses left as they are."""
+    losses = []
+    for shift_us in (0, offset_us):
+        coarse = coarse_model(model, "off")
+        coarse.camera_optimizer.begin_from(model.camera_optimizer.start_trajectory().poses)
+        coarse.camera_optimizer.shift_clock(shift_us)
+        found = heldout_losses(coarse, CoarseTraining(coarse, datamanager, _CLOCK_STEPS, seed))
+        if found is None:
+            return False
+        losses.append(found)
+    return gain(losses[0], losses[1]) > _CLOCK_DEVIATIONS
+
+
+def _nothing_moved(model: EbarfModel, datamanager: EventDataManager) -> None:
+    model.camera_optimizer.shift_clock(-int(model.camera_optimizer.clock_offset_us))
+    datamanager.shift_clock(0)
+
+
+def _begin(model: EbarfModel, coarse: EbarfModel, taken: bool) -> None:
+    """Let training begin with what the coarse field found."""
+    ours, found = model.camera_optimizer, coarse.camera_optimizer
+    trajectory, start = found.trajectory(), found.start_trajectory()
+    offset_us = int(trajectory.t_us[0] - start.t_us[0]) + int(found.clock_offset_us)
+    if offset_us:
+        ours.shift_clock(offset_us - int(ours.clock_offset_us))
+        ours.learn_clock()
     if taken:
-        model.camera_optimizer.begin_from(keyframes.trajectory().poses)
-    return Alignment(round(moved_px, 3), taken, step + 1, round(monotonic() - started, 3))
+        ours.begin_from(trajectory.poses)
+    if model.intrinsics and coarse.intrinsics:
+        model.intrinsics.load_state_dict(coarse.intrinsics.state_dict())
+    found.begin_from(trajectory.poses)
+    rough = roughness(found.before_px)
+    if rough < _SMOOTH:
+        ours.hold_to_given(_COST_IN_TRAINING, _TRANSLATION_PX)
 
 
-def _coarse_model(model: EbarfModel) -> EbarfModel:
-    """A model of the same scene that sees no more than its coarse levels, and all of whose keyframes move."""
-    config: EbarfModelConfig = deepcopy(model.config)
-    assert config.grid_finest and config.grid_levels and config.density_cells
-    config.grid_finest = max(round(config.grid_finest / _LAST_PX), config.grid_coarsest + 2)
-    config.grid_levels = max(config.grid_levels - 1, 2)
-    config.samples, config.density_cells = _SAMPLES, min(config.density_cells, _DENSITY_CELLS)
-    config.time_constant_us = config.time_constant_us or 0.0
-    knots = config.camera_optimizer
-    knots.prior, knots.every = 0.0, 1
-    knots.keyframe_stride = max(1, model.num_train_data // _MOST_KNOTS)
-    with torch.random.fork_rng():
-        coarse = config.setup(
-            scene_box=model.scene_box, num_train_data=model.num_train_data, metadata=model.kwargs["metadata"]
-        )
-    coarse.camera_optimizer.translation_px = _TRANSLATION_PX
-    return coarse.to(model.device).train()
-
-
-def _between(first: float, last: float, done: float) -> float:
-    return first * (last / first) ** done
-
-
-def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-
-
-def _shares(grid: HashGrid, of_finest: float) -> Float[Tensor, "levels"]:
-    """1 for levels up to the given share of the finest resolution, 0 beyond the next, and the first level always."""
-    resolution = torch.tensor(grid.shape.resolutions).float()
-    level = (resolution / resolution[0]).log() / (resolution[1] / resolution[0]).log()
-    last = (of_finest * resolution[-1] / resolution[0]).log() / (resolution[1] / resolution[0]).log()
-    return (last - level + 1).clamp(0, 1).maximum(torch.eye(len(level))[0]).to(grid.table.device)
+def roughness(moved: Float[Tensor, "keyframes 6"]) -> float:
+    """Mean square of the differences between neighbours over twice the variance: 1 for white noise, 0 for drift."""
+    spread = (moved - moved.mean(dim=0)).square().sum()
+    return float(moved.diff(dim=0).square().sum() / (2 * spread).clamp_min(1e-12))
 
 
 @torch.no_grad()
@@ -156,7 +184,8 @@ def _moved_px(model: EbarfModel, bundles: list[RayBundle]) -> float:
     for rays in bundles:
         t_us, direction = rays.metadata["event_t_us"][:, 0], rays.directions
         now, before = keyframes.poses_at(t_us), keyframes.start_at(t_us)
-        seen_now = rotate(now.quat_wxyz, direction)
+        learned = model.intrinsics and model.intrinsics.bearings(rays.metadata["event_pixel"][:, 0])
+        seen_now = rotate(now.quat_wxyz, direction if learned is None else learned)
         depth = model.renderer(Rays(now.position, seen_now)).depth
         point = (now.position + depth[:, None] * seen_now).double()
         away = point - before.position

@@ -112,6 +112,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     config: EventDataManagerConfig
     train_dataset: EventDataset
     eval_dataset: EventDataset
+    clock_offset_us = 0
+    """What the trajectory's times are off by."""
 
     def setup_train(self) -> None:
         """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
@@ -136,6 +138,13 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Number of this process among those that train together, on however many machines."""
         return comms.get_rank()
 
+    def shift_clock(self, offset_us: int) -> None:
+        """Take the trajectory's times for off by ``offset_us``: other events have poses then."""
+        if offset_us != self.clock_offset_us:
+            self.clock_offset_us = offset_us
+            for name in ("span_us", "index", "_training_index", "_training_batches", "facts", "heldout_pairs"):
+                self.__dict__.pop(name, None)
+
     @cached_property
     def span_us(self) -> tuple[int, int]:
         """The time in which there are both events and poses; events outside are counted and left out."""
@@ -144,7 +153,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         file = self._recording
         _, start_us, end_us = file.span()
         check_clocks(scene, (start_us, end_us), trajectory)
-        return max(start_us, int(trajectory.t_us[0])), min(end_us, int(trajectory.t_us[-1]))
+        first_us, last_us = (int(t_us) + self.clock_offset_us for t_us in trajectory.t_us[[0, -1]])
+        return max(start_us, first_us), min(end_us, last_us)
 
     @property
     def _recording(self) -> RecordingFile:
@@ -182,7 +192,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return self.index.hot_pixels if self.config.leave_out_hot_pixels else 0
 
     @property
-    def _heldout_blocks(self) -> HeldoutBlocks:
+    def heldout_blocks(self) -> HeldoutBlocks:
+        """The stretches of time whose events no training sees."""
         return HeldoutBlocks(*self.span_us, self.config.heldout_share)
 
     @cached_property
@@ -210,7 +221,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         count = total - silent - blank
         random = batch_random(self.config.seed, batch)
         pairs = self._training_index.draw_accepted(
-            count, self.config.longest_pair, random, self._heldout_blocks.training, self.refractory_us
+            count, self.config.longest_pair, random, self.heldout_blocks.training, self.refractory_us
         )
         if len(pairs) < count:
             raise RecordingError(
@@ -223,7 +234,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         drawn = self._training_index.draw_silent(
             2 * silent, self.config.longest_pair, self.span_us, random, self.refractory_us
         )
-        parts = [pairs, drawn.select(self._heldout_blocks.training(drawn)).select(slice(silent))]
+        parts = [pairs, drawn.select(self.heldout_blocks.training(drawn)).select(slice(silent))]
         if blank:
             # Most of them join a blank pixel with one that fires.
             width = self.train_dataset.scene.camera.width
@@ -240,7 +251,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Pairs that no training sees, the same for every method and seed."""
         count = self.config.eval_num_rays_per_batch // 2
         random = batch_random(_HELDOUT_SEED, 0)
-        accepted, refractory_us = self._heldout_blocks.heldout, round(self._believed_refractory_us)
+        accepted, refractory_us = self.heldout_blocks.heldout, round(self._believed_refractory_us)
         return self.index.draw_accepted(count, _LONGEST_HELDOUT_PAIR, random, accepted, refractory_us)
 
     @cached_property
@@ -275,13 +286,17 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         def tensor(column: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(column).to(self.device)
 
-        directions = self.bearings[torch.cat([tensor(pairs.pixel_before), tensor(pairs.pixel)])]
+        pixel = torch.cat([tensor(pairs.pixel_before), tensor(pairs.pixel)]).long()
+        directions = self.bearings[pixel]
         bundle = RayBundle(
             origins=torch.zeros_like(directions),
             directions=directions,
             pixel_area=torch.ones_like(directions[:, :1]),
             camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
-            metadata={"event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None]},
+            metadata={
+                "event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None],
+                "event_pixel": pixel[:, None],
+            },
         )
         columns = ("polarity_sum", "event_count", "variance", "silent")
         return bundle, {name: tensor(getattr(pairs, name)) for name in columns}

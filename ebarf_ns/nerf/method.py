@@ -44,6 +44,11 @@ def _trainer(
                 "optimizer": poses,
                 "scheduler": BudgetDecayConfig(),
             },
+            # Made use of with --learn-intrinsics alone.
+            "intrinsics": {
+                "optimizer": KeyframeAdamConfig(lr=0.03),
+                "scheduler": BudgetDecayConfig(),
+            },
         },
         logging=LoggingConfig(steps_per_log=10),
         # Whoever reaches a viewer can drive it.

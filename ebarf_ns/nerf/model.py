@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.geometry.so3 import rotate
+from ebarf_ns.nerf.intrinsics import Intrinsics
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
@@ -60,6 +61,8 @@ class EbarfModelConfig(ModelConfig):
     threshold_deviation: float | None = None
     """With Eq. 5: relative deviation of that ratio, within which training refines it; 0: it stands; None: 0 where the
     ratio is stated, else as counted."""
+    learn_intrinsics: tyro.conf.Suppress[bool] = False
+    """Set by the trainer to --learn-intrinsics."""
     threshold_prior: float = 0.01
     """What a ratio one deviation off costs, where a render wrong by a threshold costs 1."""
     time_constant_us: float | None = None
@@ -160,6 +163,7 @@ class EbarfModel(Model):
             keyframes=self.kwargs["metadata"]["keyframes"],
             focal_px=scene.camera.fx,
         )
+        self.intrinsics = Intrinsics(scene.camera) if config.learn_intrinsics else None
         self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
         self.display_range: Tensor
         self.random = torch.Generator()
@@ -168,7 +172,13 @@ class EbarfModel(Model):
         """Two groups: fields, with what is learned of the sensor, and camera_opt for the keyframe corrections."""
         groups = {"fields": [*self.renderer.parameters(), *self.sensor.parameters()]}
         self.camera_optimizer.get_param_groups(groups)
+        if self.intrinsics:
+            groups["intrinsics"] = [self.intrinsics.correction]
         return groups
+
+    def pose_parameters(self) -> list[torch.nn.Parameter]:
+        """What says where the rays of events run: all that is learned but the field and the sensor."""
+        return [one for name, group in self.get_param_groups().items() if name != "fields" for one in group]
 
     def begin_step(self, step: int, seed: int) -> None:
         """Random numbers are a function of seed and step, so that a resumed run continues as if never stopped.
@@ -183,6 +193,8 @@ class EbarfModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, and what the
         sensor is taken to be."""
+        if self.intrinsics and "event_pixel" in (ray_bundle.metadata or {}):
+            ray_bundle.directions = self.intrinsics.bearings(ray_bundle.metadata.pop("event_pixel")[:, 0])
         self._look_back(ray_bundle)
         self.camera_optimizer.apply_to_raybundle(ray_bundle)
         rays = Rays(ray_bundle.origins, ray_bundle.directions)

@@ -1,7 +1,7 @@
 """Training steps and evaluation of a model on its scene."""
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from ebarf_ns.evaluation.frames import depth_error, fit_brightness, image_errors
 from ebarf_ns.evaluation.heldout import prediction
 from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world, trajectory_results
 from ebarf_ns.files import whole_file
-from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.checkpoints import unsealed
 from ebarf_ns.nerf.datamanager import EventDataManager
@@ -84,7 +84,7 @@ class EbarfPipeline(VanillaPipeline):
     def trajectory(self, refined: bool = True) -> Trajectory:
         """The keyframes, refined or as they came, in the input's world frame and scale."""
         optimizer = self.model.camera_optimizer
-        keyframes = optimizer.trajectory() if refined else Trajectory(optimizer.keyframe_t_us, optimizer.initial())
+        keyframes = optimizer.trajectory() if refined else optimizer.given_trajectory()
         world = self._normalization.invert(keyframes)
         return Trajectory(world.t_us.cpu(), world.poses)
 
@@ -96,7 +96,7 @@ class EbarfPipeline(VanillaPipeline):
         """
         self.eval()
         trajectory_errors, scale = self._trajectory_errors()
-        results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors}
+        results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors, **self._keyframes()}
         self.train()
         # JSON knows no NaN.
         return {name: None if value != value else value for name, value in results.items()}
@@ -105,6 +105,7 @@ class EbarfPipeline(VanillaPipeline):
         """Take the parameters of a checkpoint that is whole; what nerfstudio's scripts load comes this way too."""
         with one_line_errors():
             super().load_pipeline(unsealed(loaded_state, f"step-{step:09d}.ckpt"), step)
+            self.datamanager.shift_clock(int(self.model.camera_optimizer.clock_offset_us))
 
     def _heldout(self) -> dict[str, float | None]:
         """How well held-out events are predicted, and the contrast thresholds by which they would be best."""
@@ -122,6 +123,19 @@ class EbarfPipeline(VanillaPipeline):
             "time_constant_us": max(float(self.model.sensor.time_constant_us), 0.0),
         }
 
+    def _keyframes(self) -> dict[str, float]:
+        """What was found of the trajectory's times."""
+        optimizer = self.model.camera_optimizer
+        inserted = len(optimizer.keyframe_t_us) - len(optimizer.given)
+        if not optimizer.learns_clock:
+            return {"keyframes_inserted": inserted}
+        rest = optimizer.remaining_clock_offset()
+        return {
+            "keyframes_inserted": inserted,
+            "clock_offset_ms": (int(optimizer.clock_offset_us) + rest.offset_us) * 1e-3,
+            "clock_deviation_ms": rest.deviation_us * 1e-3,
+        }
+
     @property
     def _threshold_ratio(self) -> float:
         """C_on / C_off as stated, or as counted in the recording: the same for every method and setting."""
@@ -133,15 +147,14 @@ class EbarfPipeline(VanillaPipeline):
         optimizer = self.model.camera_optimizer
         keyframe_t_us = optimizer.keyframe_t_us.cpu()
         within, outside = [], []
-        for frame in self.scene.frames:
+        for frame in map(self._as_learned, self.scene.frames):
             inside = keyframe_t_us[0] <= frame.t_us <= keyframe_t_us[-1]
             (within if inside else outside).append(frame)
         results: dict[str, float | None] = {}
         if within:
             t_us = torch.tensor([frame.t_us for frame in within])
-            initial = Poses(*(column.cpu() for column in optimizer.initial()))
             # Placed along the initial trajectory, from where the model moves them along with the refined one.
-            poses = interpolate(keyframe_t_us, initial, t_us)
+            poses = Poses(*(column.cpu() for column in optimizer.initial_at(t_us.to(optimizer.keyframe_t_us))))
             cameras = frame_cameras(within, Trajectory(t_us, poses), self._mount_scale)
             results |= self._compare(within, cameras, scale_to_reference, renders)
         if outside:
@@ -150,6 +163,13 @@ class EbarfPipeline(VanillaPipeline):
                 errors = self._compare(*placed, scale_to_reference)
                 results |= {f"{name}_outside_span": value for name, value in errors.items()}
         return results
+
+    def _as_learned(self, frame: Frame) -> Frame:
+        """A frame of the event camera itself has the intrinsics that were learned for it."""
+        intrinsics = self.model.intrinsics
+        return (
+            replace(frame, camera=intrinsics.refined()) if intrinsics and frame.camera == self.scene.camera else frame
+        )
 
     def _placed_by_reference(self, frames: list[Frame]) -> tuple[list[Frame], Cameras] | None:
         """Those within the reference's span, and their cameras."""

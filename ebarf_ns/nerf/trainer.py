@@ -39,13 +39,15 @@ from ebarf_ns.nerf.checkpoints import newest_whole, not_finite, read_checkpoint,
 from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.run_folder import take_folder
+from ebarf_ns.nerf.support import Support, support
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
-from ebarf_ns.scene import Scene, check_bounds, read_scene
+from ebarf_ns.scene import Scene, check_bounds, read_scene, write_camera
 
 _SKIPPED_IN_A_ROW, _BELIEVED = 10, 2
 _KNOWN, _BEYOND_REASON = 20, 1e4
 _SAMPLES_OF_EVENTS = 64
+_CLOCK_AT = (0.2, 0.4)
 _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
 _LEAST = {
     "machine.seed": 0,
@@ -195,6 +197,9 @@ class EbarfTrainerConfig(TrainerConfig):
     """Begin anew in a folder that holds a run."""
     allow_changed_scene: bool = False
     """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
+    learn_intrinsics: bool = False
+    """Learn focal length, principal point and the camera's distortion coefficients too; the result is written to
+    camera_refined.json, as scene.json has it."""
     averaged_steps: int = 100
     """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
 
@@ -217,6 +222,7 @@ class EbarfTrainer(Trainer):
         self.alignment: Alignment | None = None
         self.mean: list[Tensor] | None = None
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
+        self.config.pipeline.model.learn_intrinsics = self.config.learn_intrinsics  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
             for flag in ("max_num_iterations", "max_train_seconds"):
                 value = getattr(self.config, flag)
@@ -282,21 +288,25 @@ class EbarfTrainer(Trainer):
 
     def _align(self) -> None:
         """Look for large errors of the trajectory, where a run begins and its budget allows for it."""
-        model, config = self.pipeline.model, self.config
-        settings, seconds = model.config.camera_optimizer, config.max_train_seconds
-        steps = min(settings.align_steps, int(_ALIGNMENT_SHARE * config.max_num_iterations))
-        # Too few steps find nothing, and say so of any trajectory.
-        too_little = steps < settings.align_steps or (seconds is not None and seconds < _ALIGNMENT_SECONDS)
-        if self._loaded_path or settings.mode == "off" or not steps or too_little:
+        if self._loaded_path or not self._has_budget_for_coarse_fields():
             return
+        model, seconds = self.pipeline.model, self.config.max_train_seconds
         most_seconds = seconds and _ALIGNMENT_SHARE * seconds
+        steps = model.config.camera_optimizer.align_steps
         started = monotonic()
-        self.alignment = align(model, self.pipeline.datamanager, steps, config.machine.seed, most_seconds)
+        self.alignment = align(model, self.pipeline.datamanager, steps, self.config.machine.seed, most_seconds)
         if self.world_size > 1:
-            for start in (model.camera_optimizer.start_position, model.camera_optimizer.start_quat_wxyz):
+            for start in model.camera_optimizer.buffers():
                 torch.distributed.broadcast(start, 0)
+            self.pipeline.datamanager.shift_clock(int(model.camera_optimizer.clock_offset_us))
         self.train_seconds = self._agreed(monotonic() - started)
         CONSOLE.print(str(self.alignment or "no large error of the trajectory was looked for in this budget"))
+
+    def _has_budget_for_coarse_fields(self) -> bool:
+        """Too few steps find nothing, and say so of any trajectory."""
+        settings, seconds = self.pipeline.model.config.camera_optimizer, self.config.max_train_seconds
+        enough = 0 < settings.align_steps <= _ALIGNMENT_SHARE * self.config.max_num_iterations
+        return enough and settings.mode == "refine" and not (seconds and seconds < _ALIGNMENT_SECONDS)
 
     def _lines_of_resumed_run(self, lines: list[Line]) -> list[Line]:
         """The plan that a loaded checkpoint was made by, whatever would be planned on this machine today."""
@@ -404,6 +414,8 @@ class EbarfTrainer(Trainer):
         self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2 * self.world_size
         self.pipeline.record_cost(self.train_seconds, self.event_pairs)
         after = self.progress()
+        if any(before < share <= after for share in _CLOCK_AT):
+            self._set_clock()
         self.last_loss = float(result[0].detach())
         if after >= 1:
             # Evaluation may fail, or take long: what was learned is safe before.
@@ -413,6 +425,15 @@ class EbarfTrainer(Trainer):
         if after >= 1:
             self.stop_training = True
         return result
+
+    def _set_clock(self) -> None:
+        """Where the clock is learned, give it what the corrections have taken on of it: they cost, and it does not."""
+        keyframes = self.pipeline.model.camera_optimizer
+        if self.alignment and not self.alignment.taken and keyframes.learns_clock:
+            offset = keyframes.remaining_clock_offset()
+            if offset.certain:
+                keyframes.explain_by_clock(offset.offset_us)
+                self.pipeline.datamanager.shift_clock(int(keyframes.clock_offset_us))
 
     def _average(self) -> None:
         """Let the mean of the parameters follow: over the last tenth of the steps, over ``averaged_steps`` at most."""
@@ -458,7 +479,8 @@ class EbarfTrainer(Trainer):
         self.evaluated_step = self.steps_done
         with self._averaged():
             results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
-            write_tum(self.base_dir / "trajectory_refined.txt", self.pipeline.trajectory())
+            self._write_refined(results)
+            support_found = self._support() if final else None
         record = {
             "step": self.steps_done,
             "train_seconds": round(self.train_seconds, 3),
@@ -468,11 +490,34 @@ class EbarfTrainer(Trainer):
             "skipped_steps": self.optimizers.skipped,
             "peak_memory_mib": round(peak_memory_mib(self.device), 1),
         }
+        if support_found:
+            record["support"] = {"verdict": support_found.verdict, **asdict(support_found)}
         self._record_metrics(record)
         numbers = {name: value for name, value in results.items() if isinstance(value, float)}
         writer.put_dict(name="Evaluation", scalar_dict=numbers, step=step)
         shown = "  ".join(f"{name} {value:.4g}" for name, value in numbers.items())
         CONSOLE.print(f"step {self.steps_done}, {self.train_seconds:.1f} s, {self.event_pairs:,} pairs:  {shown}")
+        if support_found:
+            CONSOLE.print(str(support_found))
+
+    def _write_refined(self, results: dict[str, Any]) -> None:
+        comments = []
+        if results["keyframes_inserted"]:
+            comments.append(f"inserted keyframes: {results['keyframes_inserted']}")
+        given, refined = self.pipeline.trajectory(refined=False), self.pipeline.trajectory()
+        if added_us := int(refined.t_us[0] - given.t_us[0]):
+            comments.append(f"clock of the events: {added_us:+} us were added to the times given")
+        write_tum(self.base_dir / "trajectory_refined.txt", refined, comments)
+        if self.pipeline.model.intrinsics:
+            write_camera(self.base_dir / "camera_refined.json", self.pipeline.model.intrinsics.refined())
+
+    def _support(self) -> Support | None:
+        """What held-out events say of the refined trajectory, where there is the budget to ask them."""
+        if not self._has_budget_for_coarse_fields():
+            return None
+        model = self.pipeline.model
+        steps = model.config.camera_optimizer.align_steps // 2
+        return support(model, self.pipeline.datamanager, steps, self.config.machine.seed)
 
     @check_main_thread
     def _begin_metrics(self) -> None:

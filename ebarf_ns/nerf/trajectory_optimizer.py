@@ -11,13 +11,25 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor, nn
 
+from ebarf_ns.geometry.clock import ClockOffset, clock_offset
 from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix, rotate, turn_between
-from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, corrected, interpolate, intervals
+from ebarf_ns.geometry.trajectory import (
+    Interpolation,
+    Poses,
+    Trajectory,
+    corrected,
+    densified,
+    interpolate,
+    intervals,
+    within_span,
+)
 from ebarf_ns.nerf.dataparser import opengl_from_opencv
 
 _GOOD_PX = 0.4
 _SETTLED_STEP = 1000
+# Rotations tell the clock; translations go astray together with the depth of what is seen.
+_TRANSLATIONS_TELL = 0.3
 
 
 @dataclass
@@ -34,6 +46,8 @@ class TrajectoryOptimizerConfig(CameraOptimizerConfig):
     """Begin from a smoothing spline through the keyframes; it leaves keyframes on a smooth path where they are."""
     align_steps: int = 400
     """Before training, look for large errors in so many steps of a coarse field; 0: do not."""
+    longest_gap_us: int | None = None
+    """Insert keyframes where those given are further apart than this; 0: nowhere; None: as planned."""
     keyframe_stride: int | None = None
     """Learn a correction for every so many-th keyframe, and interpolate it to those between; None: as planned."""
     prior: float = 0.01
@@ -72,20 +86,38 @@ class TrajectoryOptimizer(CameraOptimizer):
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
         self.pixel_rad = 1 / focal_px
-        self.translation_px = 1.0
-        """Pixels at unit distance that a translation by one moves the image."""
+        start, kind, gap_us = config.start(keyframes), config.interpolation or "linear", config.longest_gap_us or 0
+        start, _ = densified(start, gap_us, kind)
+        keyframes, given = densified(keyframes, gap_us, kind)
+        self.register_buffer("given", given, persistent=False)
+        """Which of the keyframes came with the scene; the others are inserted."""
+        self.given: Tensor
         self.register_buffer("keyframe_t_us", keyframes.t_us.clone())
+        self.register_buffer("clock_offset_us", torch.zeros((), dtype=torch.int64))
+        """What the times of the given keyframes are off by; ``keyframe_t_us`` are on the clock of the events."""
+        self.clock_offset_us: Tensor
         self.register_buffer("initial_position", keyframes.poses.position.clone())
         self.register_buffer("initial_quat_wxyz", keyframes.poses.quat_wxyz.clone())
         self.keyframe_t_us: Tensor
         self.initial_position: Tensor
         self.initial_quat_wxyz: Tensor
-        start = config.start(keyframes).poses
-        self.register_buffer("start_position", start.position.clone())
-        self.register_buffer("start_quat_wxyz", start.quat_wxyz.clone())
+        self.register_buffer("start_position", start.poses.position.clone())
+        self.register_buffer("start_quat_wxyz", start.poses.quat_wxyz.clone())
         self.start_position: Tensor
         self.start_quat_wxyz: Tensor
+        self.register_buffer("before_px", torch.zeros(len(keyframes.t_us), 6))
+        """How far training begins from the given keyframes: rotations, and translations at unit distance, in pixels."""
+        self.before_px: Tensor
+        self.begin_from(start.poses)
         knots = _every(config.keyframe_stride or 1, len(keyframes.t_us))
+        self.register_buffer("knots", knots, persistent=False)
+        self.knots: Tensor
+        self.register_buffer("unit", torch.ones(6))
+        """Pixels at unit distance that a correction by one moves the image."""
+        self.register_buffer("hold", torch.zeros(()))
+        """What a squared pixel of distance to the given keyframes costs."""
+        self.unit: Tensor
+        self.hold: Tensor
         # Between which knots each keyframe lies never changes.
         left, fraction = intervals(keyframes.t_us[knots], keyframes.t_us)
         self.register_buffer("left_knot", left, persistent=False)
@@ -94,21 +126,94 @@ class TrajectoryOptimizer(CameraOptimizer):
         self.way_to_next_knot: Tensor
         if config.mode == "refine":
             self.correction = nn.Parameter(torch.zeros(len(knots), 6))
+            self.clock_px = nn.Parameter(torch.zeros(1, 1))
+            """What the keyframes' times are off by, beyond ``clock_offset_us``, in pixels of the mean motion."""
+        self.register_buffer("clock_us_per_px", torch.zeros((), dtype=torch.float64))
+        self.clock_us_per_px: Tensor
 
     def begin_step(self, step: int) -> None:
         """Let the keyframes learn, or leave it: their gradients make a step a fifth longer."""
         if self.config.mode == "refine":
             every = self.config.every ** (1 if step < _SETTLED_STEP else 2)
-            self.correction.requires_grad_(step % every == 0)
+            for one in (self.correction, self.clock_px):
+                one.requires_grad_(step % every == 0)
 
     def begin_from(self, start: Poses) -> None:
         """Correct these keyframes from now on."""
         self.start_position.copy_(start.position)
         self.start_quat_wxyz.copy_(start.quat_wxyz)
+        self.before_px.copy_(_correction(self.initial(), start) / self.pixel_rad)
+
+    @torch.no_grad()
+    def shift_clock(self, offset_us: int) -> None:
+        """Add ``offset_us`` to the times of all keyframes; corrections stay those of their keyframe."""
+        self.keyframe_t_us += offset_us
+        self.clock_offset_us += offset_us
+
+    @torch.no_grad()
+    def learn_clock(self) -> None:
+        """Let what the times of all keyframes are off by be learned from now on."""
+        self.clock_us_per_px.copy_(1e6 / (self._speed_rad_s() / self.pixel_rad))
+
+    def _speed_rad_s(self) -> Tensor:
+        """Root mean square motion of the image, at unit distance."""
+        start = self._start()
+        turn = turn_between(start.quat_wxyz[:-1], start.quat_wxyz[1:])
+        moved = torch.cat([turn, start.position.diff(dim=0)], dim=-1).double().norm(dim=-1)
+        return (moved / (self.keyframe_t_us.diff() * 1e-6)).square().mean().sqrt().clamp_min(1e-6)
+
+    def clock_us(self) -> Float[Tensor, ""] | None:
+        """What is learned of the clock, beyond ``clock_offset_us``; None where poses stay as they are."""
+        return (self.clock_us_per_px * self.clock_px)[0, 0] if self.config.mode == "refine" else None
+
+    @property
+    def learns_clock(self) -> bool:
+        """Whether :meth:`learn_clock` was called."""
+        return bool(self.clock_us_per_px > 0)
+
+    def remaining_clock_offset(self) -> ClockOffset:
+        """What the corrections say that the clock is off by, beyond ``clock_offset_us``."""
+        kind, translation = self.config.interpolation or "linear", float(self.unit[3])
+        given = Trajectory(self.keyframe_t_us, self.initial())
+        return clock_offset(given, self.trajectory(), min(translation, _TRANSLATIONS_TELL), kind)
+
+    @torch.no_grad()
+    def explain_by_clock(self, offset_us: int) -> None:
+        """Shift the clock by this in place of what was learned of it, and leave in the corrections what it does not
+        explain, so that the motion stays as it is.
+
+        Where the shifted trajectory goes beyond the old one, corrections are those of its nearest keyframe.
+        """
+        before, kind = self.trajectory(), self.config.interpolation or "linear"
+        self.shift_clock(offset_us)
+        self.clock_px.zero_()
+        t_us = self.keyframe_t_us[self.knots]
+        inside = within_span(t_us, before.t_us)
+        start = Poses(*(column[self.knots][inside] for column in self._start()))
+        left = _correction(start, interpolate(before.t_us, before.poses, t_us[inside], kind))
+        known = inside.nonzero()[:, 0]
+        nearest = (torch.arange(len(t_us), device=t_us.device) - known[0]).clamp(0, len(known) - 1)
+        self.correction.copy_(left[nearest] / self.pixel_rad / self.unit)
+
+    def hold_to_given(self, cost: float, translation: float) -> None:
+        """Let every squared pixel of distance to the given keyframes cost something, and translations move less.
+
+        Odometry errs by degrees rather than by pixels of translation. What moves the image alike is told apart by the
+        cost, and by ``translation``, the pixels at unit distance that a correction by one shifts: without them,
+        rotation and shift grow together, in opposition.
+        """
+        self.hold.fill_(cost)
+        self.unit[3:] = translation
 
     def initial(self) -> Poses:
         """The keyframes as they came."""
         return Poses(self.initial_position, self.initial_quat_wxyz)
+
+    def given_trajectory(self) -> Trajectory:
+        """The trajectory as it came with the scene."""
+        given = self.given
+        t_us = self.keyframe_t_us - self.clock_offset_us
+        return Trajectory(t_us[given], Poses(*(column[given] for column in self.initial())))
 
     def keyframes(self) -> Poses:
         """The keyframes as corrected so far."""
@@ -119,26 +224,35 @@ class TrajectoryOptimizer(CameraOptimizer):
         if len(correction) < len(self.keyframe_t_us):
             left, right = correction[self.left_knot], correction[self.left_knot + 1]
             correction = torch.lerp(left, right, self.way_to_next_knot.to(correction))
-        if self.translation_px != 1:
-            correction = correction * correction.new_tensor([1.0] * 3 + [self.translation_px] * 3)
-        return corrected(start, self.pixel_rad * correction)
+        return corrected(start, self.pixel_rad * self.unit * correction)
+
+    def start_trajectory(self) -> Trajectory:
+        """What is corrected, on the clock of the events."""
+        return Trajectory(self.keyframe_t_us, self._start())
 
     def _start(self) -> Poses:
         return Poses(self.start_position, self.start_quat_wxyz)
 
     def trajectory(self) -> Trajectory:
-        """The corrected keyframes and their times, detached."""
-        poses = self.keyframes()
-        return Trajectory(self.keyframe_t_us, Poses(poses.position.detach(), poses.quat_wxyz.detach()))
+        """The corrected keyframes and their times on the clock of the events, detached."""
+        poses, clock_us = self.keyframes(), self.clock_us()
+        t_us = self.keyframe_t_us if clock_us is None else self.keyframe_t_us + clock_us.detach().round().long()
+        return Trajectory(t_us, Poses(poses.position.detach(), poses.quat_wxyz.detach()))
 
     def poses_at(self, t_us: Int[Tensor, "*batch"], delay_us: Float[Tensor, "*batch"] | None = None) -> Poses:
         """Corrected poses at given times, or as much earlier as ``delay_us`` says."""
-        kind = self.config.interpolation or "linear"
+        kind, clock_us = self.config.interpolation or "linear", self.clock_us()
+        if clock_us is not None:
+            delay_us = clock_us.expand(t_us.shape) if delay_us is None else clock_us + delay_us
         return interpolate(self.keyframe_t_us, self.keyframes(), t_us, kind, delay_us)
 
     def start_at(self, t_us: Int[Tensor, "*batch"]) -> Poses:
         """Where training began from, at given times."""
         return interpolate(self.keyframe_t_us, self._start(), t_us, self.config.interpolation or "linear")
+
+    def initial_at(self, t_us: Int[Tensor, "*batch"]) -> Poses:
+        """The poses as they came, at given times on their own clock."""
+        return interpolate(self.keyframe_t_us - self.clock_offset_us, self.initial(), t_us)
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Turn event rays, given in the camera's frame at their time, into world rays; others already are."""
@@ -153,7 +267,8 @@ class TrajectoryOptimizer(CameraOptimizer):
         """From refined to initial camera frame of keyframes, in nerfstudio's axes, to be multiplied on the right."""
         flip = torch.tensor([1.0, -1.0, -1.0], device=self.keyframe_t_us.device)
         initial, refined = (
-            Poses(p.position[indices], p.quat_wxyz[indices]) for p in (self.initial(), self.keyframes())
+            Poses(p.position[self.given[indices]], p.quat_wxyz[self.given[indices]])
+            for p in (self.initial(), self.keyframes())
         )
         to_initial = quat_wxyz_to_matrix(initial.quat_wxyz).mT
         rotation = to_initial @ quat_wxyz_to_matrix(refined.quat_wxyz)
@@ -167,7 +282,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         if t_us is None:
             return camera_to_world
         t_us = t_us.to(self.keyframe_t_us.device)[..., 0]
-        initial = interpolate(self.keyframe_t_us, self.initial(), t_us).matrix()
+        initial = self.initial_at(t_us).matrix()
         refined = self.poses_at(t_us).matrix()
         given = opengl_from_opencv(camera_to_world).to(refined)
         local = initial[..., :3].mT @ torch.cat([given[..., :3], given[..., 3:] - initial[..., 3:]], dim=-1)
@@ -181,32 +296,38 @@ class TrajectoryOptimizer(CameraOptimizer):
         Keyframes that are off by a mean square of m pixels, by where training began and by corrections, cost
         m / (m + 0.4²) times the prior (Geman and McClure, 1987). A good trajectory stays where a field that is yet to
         take shape would bend it, and the more so as the events' own loss falls; nothing draws one back that was noisy,
-        or drifted by pixels.
+        or drifted by pixels. One that drifted, and is held for it, costs by the square of that besides.
         """
-        if self.config.mode == "refine" and self.config.prior:
-            before_px2 = _mean_squared_distance(self.initial(), self._start()) / self.pixel_rad**2
-            off_px2 = before_px2 + self.correction.square().sum(dim=-1).mean()
-            loss_dict["trajectory_prior"] = self.config.prior * off_px2 / (off_px2 + _GOOD_PX**2)
+        if self.config.mode == "refine":
+            off_px2 = self.before_px.square().sum(dim=-1).mean() + self.correction.square().sum(dim=-1).mean()
+            off = self.before_px[self.knots] / self.unit + self.correction
+            saturating = self.config.prior * off_px2 / (off_px2 + _GOOD_PX**2)
+            loss_dict["trajectory_prior"] = saturating + self.hold * off.square().sum(dim=-1).mean()
 
     def get_metrics_dict(self, metrics_dict: dict) -> None:
         """Mean size of the corrections, in pixels."""
         if self.config.mode == "refine":
             metrics_dict["correction_rotation_px"] = self.correction[:, :3].detach().norm(dim=-1).mean()
+            clock_us = self.clock_us()
+            assert clock_us is not None
+            metrics_dict["clock_offset_ms"] = (self.clock_offset_us + clock_us.detach()) * 1e-3
             metrics_dict["correction_translation_px"] = self.correction[:, 3:].detach().norm(dim=-1).mean()
 
     def get_param_groups(self, param_groups: dict) -> None:
         """The corrections, under nerfstudio's name for camera parameters."""
         if self.config.mode == "refine":
-            param_groups["camera_opt"] = [self.correction]
-
-
-def _mean_squared_distance(some: Poses, others: Poses) -> Float[Tensor, ""]:
-    """Mean squared distance of poses: of rotations in radians, and of positions."""
-    rotation = turn_between(some.quat_wxyz, others.quat_wxyz)
-    return (rotation.square() + (some.position - others.position).square()).sum(dim=-1).mean()
+            param_groups["camera_opt"] = [self.correction, self.clock_px]
 
 
 def _every(stride: int, count: int) -> Int[Tensor, "knots"]:
     """Every ``stride``-th of ``count``, and the last."""
     last = torch.tensor([count - 1])
     return torch.cat([torch.arange(0, count - 1, stride), last])
+
+
+def _correction(some: Poses, others: Poses) -> Float[Tensor, "keyframes 6"]:
+    """What takes ``some`` to ``others``, by :func:`corrected`."""
+    back = some.quat_wxyz * some.quat_wxyz.new_tensor([1.0, -1, -1, -1])
+    return torch.cat(
+        [turn_between(some.quat_wxyz, others.quat_wxyz), rotate(back, others.position - some.position)], dim=-1
+    )

@@ -87,7 +87,43 @@ def test_keyframes_learn_in_every_so_many_th_step_and_less_often_later(every: in
 def test_no_prior_is_no_loss(options: dict):
     losses = {"event_loss": torch.tensor(0.2)}
     optimizer(**options).get_loss_dict(losses)
-    assert list(losses) == ["event_loss"]
+    assert float(sum(losses.values())) == pytest.approx(0.2)
+
+
+def test_what_is_held_costs_by_the_square_of_its_distance_to_the_keyframes_given():
+    held = optimizer(moved=False, prior=0.0)
+    held.begin_from(corrected(keyframes().poses, torch.tensor([3.0, 0, 0, 0, 0, 4.0]).expand(COUNT, 6)))
+    held.hold_to_given(1e-3, 0.5)
+    losses: dict = {}
+    held.get_loss_dict(losses)
+    assert float(losses["trajectory_prior"]) == pytest.approx(1e-3 * (3**2 + (4 / 0.5) ** 2), rel=1e-4)
+
+
+def test_a_clock_that_is_off_moves_times_and_leaves_the_motion():
+    late = optimizer(interpolation="linear")
+    t_us = keyframes().t_us[1:] + 10_000
+    before = late.poses_at(t_us[:-1])
+    late.explain_by_clock(10_000)
+    assert torch.equal(late.trajectory().t_us, keyframes().t_us + 10_000)
+    assert torch.equal(late.given_trajectory().t_us, keyframes().t_us)
+    assert torch.equal(late.given_trajectory().poses.position, keyframes().poses.position)
+    assert torch.allclose(late.poses_at(t_us[:-1]).position, before.position, atol=1e-5)
+
+
+def test_the_clock_is_learned_once_it_may_be():
+    late, t_us = optimizer(moved=False), keyframes().t_us[1:3] + 20_000
+    goal = interpolate(keyframes().t_us, keyframes().poses, t_us - 8_000).position
+    late.learn_clock()
+    rate = torch.optim.LBFGS([late.clock_px], max_iter=50, line_search_fn="strong_wolfe")
+
+    def loss() -> torch.Tensor:
+        rate.zero_grad()
+        error = (late.poses_at(t_us).position - goal).square().sum()
+        error.backward()
+        return error
+
+    rate.step(loss)  # pyright: ignore[reportArgumentType]
+    assert abs(int(late.trajectory().t_us[0]) - 8_000) < 50
 
 
 def test_viewer_and_exporter_see_the_same_refined_keyframes():
