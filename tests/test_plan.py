@@ -193,3 +193,33 @@ def test_a_spline_only_where_the_motion_between_keyframes_needs_and_carries_it(
     scene: Scene, trajectory: Trajectory, expected: str
 ):
     assert planned(scene, trajectory=trajectory)["interpolation"] == expected
+
+
+def shaken(hertz: float, every_us: int, count: int) -> Trajectory:
+    """A camera that turns to and fro by a tenth of a radian, so many times a second."""
+    t_us = torch.arange(count) * every_us
+    angle = 0.1 * torch.sin(2 * torch.pi * hertz * t_us.double() * 1e-6)
+    zero = torch.zeros_like(angle)
+    return Trajectory(
+        t_us,
+        Poses(
+            torch.stack([0.1 * angle, zero, zero], 1),
+            torch.stack([(angle / 2).cos(), zero, (angle / 2).sin(), zero], 1),
+        ),
+    )
+
+
+def test_keyframes_are_inserted_where_those_given_do_not_tell_the_motion(scene: Scene):
+    swift, slow = shaken(1.5, 200_000, 11), shaken(0.1, 200_000, 11)
+    assert 45_000 <= planned(scene, trajectory=swift)["longest_gap_us"] <= 100_000
+    assert planned(scene, trajectory=swift)["keyframe_stride"] == 1
+    assert planned(scene, trajectory=slow)["longest_gap_us"] == 0
+    assert planned(scene, trajectory=shaken(1.5, 50_000, 41))["longest_gap_us"] == 0
+
+
+def test_keyframes_are_inserted_in_gaps(scene: Scene):
+    even = shaken(0.2, 50_000, 61)
+    kept = torch.tensor([k for k in range(61) if not 20 < k < 40])
+    uneven = Trajectory(even.t_us[kept], Poses(*(column[kept] for column in even.poses)))
+    assert planned(scene, trajectory=even)["longest_gap_us"] == 0
+    assert planned(scene, trajectory=uneven)["longest_gap_us"] == 50_000

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from ebarf_ns.evaluation.basin import basin_figure, worse_lines
 from ebarf_ns.files import whole_file
 
 Record = dict[str, Any]
@@ -43,10 +44,11 @@ def write_diagrams(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write the diagrams as SVG and the tables as Markdown; returns their paths."""
     records = result["records"]
     written = []
-    for figure, name in (
-        (_work_precision(records, result["roles"]), "work_precision"),
-        (_profiles(records), "profile"),
-    ):
+    figures = {"work_precision": _work_precision(records, result["roles"]), "profile": _profiles(records)}
+    refining = _refining(result)
+    if len({record["trajectory"] for record in refining}) > 1:
+        figures["basin"] = basin_figure(refining)
+    for name, figure in figures.items():
         with whole_file(folder / f"{name}.svg") as temporary:
             figure.savefig(temporary, format="svg", bbox_inches="tight")
         plt.close(figure)
@@ -54,6 +56,10 @@ def write_diagrams(result: dict[str, Any], folder: Path) -> list[Path]:
     with whole_file(folder / "tables.md") as temporary:
         temporary.write_text(tables(result), encoding="utf-8")
     return [*written, folder / "tables.md"]
+
+
+def _refining(result: dict[str, Any]) -> list[Record]:
+    return [record for record in result["records"] if result["roles"].get(record["method"], "method") == "method"]
 
 
 def error_of(evaluation: Record, name: str) -> float:
@@ -233,6 +239,7 @@ def tables(result: dict[str, Any]) -> str:
         *("", *_against_others(panels, result["roles"])),
         *("", "Seconds of training until reached:"),
         *("", *_seconds_until(panels)),
+        *("", *worse_lines(_refining(result))),
         *("", f"{count} failed."),
         *(f"- {record['method']}, {record['scene']}, seed {record['seed']}: {record['error']}" for record in failed),
     ]

@@ -104,7 +104,12 @@ def _curves_figure(evaluations: list[dict[str, Any]]) -> Figure:
 
 def _page(header: dict[str, Any], evaluations: list[dict[str, Any]], report: Path, renders: list[Path]) -> str:
     missing = lpips_note(evaluations[-1])
-    columns = [key for key in evaluations[-1] if any(record.get(key) is not None for record in evaluations)]
+    columns = [
+        key
+        for key in evaluations[-1]
+        if key != "support" and any(record.get(key) is not None for record in evaluations)
+    ]
+    says = html.escape((evaluations[-1].get("support") or {}).get("says", "")).replace("\n", "<br>")
     rows = "".join(
         "<tr>" + "".join(f"<td>{_cell(record.get(key))}</td>" for key in columns) + "</tr>" for record in evaluations
     )
@@ -124,7 +129,8 @@ def _page(header: dict[str, Any], evaluations: list[dict[str, Any]], report: Pat
 td,th{{padding:.1rem .6rem;text-align:right}}.text{{text-align:left}}figure{{display:inline-block;margin:.3rem}}
 img{{width:24rem;image-rendering:pixelated}}table{{display:block;overflow-x:auto}}</style>
 <h1>{html.escape(str(header.get("method", "run")))}</h1><p>{facts}</p>
-<h2>Trajectory</h2><p>Aligned to the reference where there is one (by orientation and scale).</p>{svgs}
+<h2>Trajectory</h2><p>{says}</p>
+<p>Aligned to the reference where there is one (by orientation and scale).</p>{svgs}
 <h2>Evaluations</h2><table><tr>{"".join(f"<th>{html.escape(key)}</th>" for key in columns)}</tr>{rows}</table>
 <p>{html.escape(missing or "")}</p>
 <h2>Views at the refined poses</h2>{pictures or "<p>The scene has no frames to compare with.</p>"}

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from ebarf_ns.nerf.datamanager import EventDataManager
     from ebarf_ns.nerf.model import EbarfModel
+    from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer
 
 # Both runs that drifted by 12 pixels (5 degrees) came back with these.
 _FIRST_RATE, _LAST_RATE, _POWER = 0.4, 0.05, 0.25
@@ -35,7 +36,8 @@ _TRANSLATION_PX, _COST = 0.3, 1e-4
 _COST_IN_TRAINING, _SMOOTH = 3e-4, 0.06
 _PROBE, _CERTAINLY_GOOD_PX, _GOOD_PX = 200, 1.0, 1.8
 _BATCHES_TO_MEASURE = 2
-_INTRINSICS_ALONE = 0.5
+# A field adapts to the intrinsics that it grows up with: a second one brings 0.7 % of the focal length to 0.2 %.
+_INTRINSICS_FROM, _INTRINSICS_PASSES = 0.2, 2
 _WARM_UP = 5
 _CLOCK_EVERY, _LEAST_CLOCK_PX = 100, 0.2
 # What the rate of events says of the clock is looked into when it says a lot.
@@ -74,20 +76,18 @@ def align(
     """
     started = monotonic()
     _set_clock_by_activity(model, datamanager, seed)
+    for _ in range(_INTRINSICS_PASSES if model.intrinsics else 0):
+        _set_intrinsics(model, datamanager, steps, seed)
     coarse = coarse_model(model)
     keyframes = coarse.camera_optimizer
     keyframes.hold_to_given(_COST, _TRANSLATION_PX)
     if keyframes.clock_offset_us:
         keyframes.learn_clock()
-    moving = [[*keyframes.parameters()], [*coarse.intrinsics.parameters()] if coarse.intrinsics else []]
-    poses = KeyframeAdam([{"params": one} for one in moving if one], lr=_FIRST_RATE, power=_POWER)
+    poses = KeyframeAdam(keyframes.parameters(), lr=_FIRST_RATE, power=_POWER)
     training = CoarseTraining(coarse, datamanager, steps, seed)
     moved_px, warm = 0.0, started
     for step in range(steps):
         set_rate(poses, between(_FIRST_RATE, _LAST_RATE, step / steps))
-        if coarse.intrinsics and step < _INTRINSICS_ALONE * steps:
-            # Together, rotations take on much of what a wrong focal length does to them.
-            poses.param_groups[0]["lr"] = 0.0
         if not training.step(step, poses):
             return _nothing_moved(model, datamanager)
         if step == _WARM_UP:
@@ -95,11 +95,8 @@ def align(
         elif most_seconds and step == 5 * _WARM_UP and (monotonic() - warm) / (4 * _WARM_UP) * steps > most_seconds:
             return _nothing_moved(model, datamanager)
         if (step + 1) % _CLOCK_EVERY == 0:
-            offset = keyframes.remaining_clock_offset()
-            matters = offset.moved_rad > _LEAST_CLOCK_PX * keyframes.pixel_rad
-            asked = step + 1 == _PROBE and offset.likely
-            if matters and (offset.certain or (asked and _is_better(model, datamanager, offset.offset_us, seed))):
-                keyframes.explain_by_clock(offset.offset_us)
+            if offset_us := _clock_offset_us(model, datamanager, keyframes, step + 1 == _PROBE, seed):
+                keyframes.explain_by_clock(offset_us)
                 keyframes.learn_clock()
                 datamanager.shift_clock(int(keyframes.clock_offset_us))
                 poses.state.clear()
@@ -107,7 +104,7 @@ def align(
             moved_px = _moved_px(coarse, [datamanager.next_train(step + k)[0] for k in range(_BATCHES_TO_MEASURE)])
             if not moved_px < float("inf"):
                 return _nothing_moved(model, datamanager)
-            if moved_px < _CERTAINLY_GOOD_PX and not coarse.intrinsics:
+            if moved_px < _CERTAINLY_GOOD_PX:
                 break
     taken = moved_px >= _GOOD_PX
     _begin(model, coarse, taken)
@@ -127,6 +124,38 @@ def _set_clock_by_activity(model: EbarfModel, datamanager: EventDataManager, see
     if says_a_lot and _is_better(model, datamanager, offset_us, seed):
         keyframes.shift_clock(offset_us)
         datamanager.shift_clock(offset_us)
+
+
+def _clock_offset_us(
+    model: EbarfModel, datamanager: EventDataManager, keyframes: TrajectoryOptimizer, in_doubt: bool, seed: int
+) -> int:
+    """What the corrections of ``keyframes`` so far say that the clock is off by; 0: nothing.
+
+    Other errors may look like a late clock. So a field is asked as well, before there is any offset, and ``in_doubt``
+    even where the corrections alone would not do.
+    """
+    offset = keyframes.remaining_clock_offset()
+    if offset.moved_rad < _LEAST_CLOCK_PX * keyframes.pixel_rad:
+        return 0
+    if keyframes.learns_clock:
+        return offset.offset_us if offset.certain else 0
+    asked = offset.certain or (in_doubt and offset.likely)
+    return offset.offset_us if asked and _is_better(model, datamanager, offset.offset_us, seed) else 0
+
+
+def _set_intrinsics(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: int) -> None:
+    """Learn the intrinsics from the trajectory as it is: moving ones take on much of what a focal length does."""
+    coarse = coarse_model(model, "off")
+    assert model.intrinsics and coarse.intrinsics
+    coarse.camera_optimizer.begin_from(model.camera_optimizer.start_trajectory().poses)
+    intrinsics = KeyframeAdam(coarse.intrinsics.parameters(), power=_POWER)
+    training = CoarseTraining(coarse, datamanager, steps, seed)
+    for step in range(steps):
+        young = step < _INTRINSICS_FROM * steps
+        set_rate(intrinsics, 0.0 if young else between(_FIRST_RATE, _LAST_RATE, step / steps))
+        if not training.step(step, intrinsics):
+            return
+    model.intrinsics.load_state_dict(coarse.intrinsics.state_dict())
 
 
 def _is_better(model: EbarfModel, datamanager: EventDataManager, offset_us: int, seed: int) -> bool:
@@ -158,8 +187,6 @@ def _begin(model: EbarfModel, coarse: EbarfModel, taken: bool) -> None:
         ours.learn_clock()
     if taken:
         ours.begin_from(trajectory.poses)
-    if model.intrinsics and coarse.intrinsics:
-        model.intrinsics.load_state_dict(coarse.intrinsics.state_dict())
     found.begin_from(trajectory.poses)
     rough = roughness(found.before_px)
     if rough < _SMOOTH:

@@ -30,7 +30,7 @@ _FEWEST_PAIRS = 20
 def coarse_model(model: EbarfModel, mode: Literal["refine", "off"] = "refine") -> EbarfModel:
     """A model of the same scene that sees no more than its coarse levels, all of whose keyframes move, or none.
 
-    Its keyframes are on the clock of the events as ``model`` has it.
+    It begins with the clock and the intrinsics of ``model``.
     """
     config: EbarfModelConfig = deepcopy(model.config)
     assert config.grid_finest and config.grid_levels and config.density_cells
@@ -46,6 +46,8 @@ def coarse_model(model: EbarfModel, mode: Literal["refine", "off"] = "refine") -
             scene_box=model.scene_box, num_train_data=model.num_train_data, metadata=model.kwargs["metadata"]
         )
     coarse.camera_optimizer.shift_clock(int(model.camera_optimizer.clock_offset_us))
+    if coarse.intrinsics and model.intrinsics:
+        coarse.intrinsics.load_state_dict(model.intrinsics.state_dict())
     return coarse.to(model.device).train()
 
 

@@ -123,6 +123,9 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         if self.test_mode == "val":
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
             CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
+            total, _, _ = self._recording.span()
+            if events < total:
+                CONSOLE.print(f"left out {total - events:,} events: doubled, or outside the trajectory's span")
             if self.hot_pixels_left_out:
                 CONSOLE.print(f"left out {self.hot_pixels_left_out:,} hot pixels, 3 times busier than their neighbours")
             if self.refractory_us:
@@ -167,13 +170,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         file = self._recording
         memory_bytes = int(self.config.index_memory_gib * 2**30)
         within = lambda: (chunk.between(*self.span_us) for chunk in file.chunks())  # noqa: E731
-        index = index_pairs(within, file.width, file.height, memory_bytes, self.config.doubles_us or 0)
-        total, _, _ = file.span()
-        if len(index.events) < total:
-            CONSOLE.print(
-                f"left out {total - len(index.events):,} of {total:,} events: doubled, or outside the trajectory's span"
-            )
-        return index
+        return index_pairs(within, file.width, file.height, memory_bytes, self.config.doubles_us or 0)
 
     @cached_property
     def _training_index(self) -> PairIndex:

@@ -1,38 +1,63 @@
-"""After training: whether the events speak for the refined trajectory, or for the one that was given.
+"""After training: what events that were held out say of the refined trajectory.
 
-The field that was trained along with the refined keyframes agrees with them, right or wrong. So two coarse fields are
-trained alike, one from either trajectory, neither of which moves, and predict events that nothing was trained on.
+The field that was trained along with the refined keyframes agrees with them, right or wrong. So coarse fields are
+trained alike, each from a trajectory that does not move: the refined one, the one given, and the refined one moved
+where events tell little.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 
 from ebarf_ns.geometry.so3 import rotate
-from ebarf_ns.geometry.trajectory import corrected
+from ebarf_ns.geometry.trajectory import Trajectory, corrected
 from ebarf_ns.nerf.coarse import CoarseTraining, coarse_model, gain, heldout_losses
-from ebarf_ns.photometry.brightness import log_brightness
-from ebarf_ns.photometry.event_loss import reported_change
 from ebarf_ns.radiance.ray_sampling import Rays
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Float
 
-    from ebarf_ns.geometry.trajectory import Poses
     from ebarf_ns.nerf.datamanager import EventDataManager
     from ebarf_ns.nerf.model import EbarfModel
 
+    Losses = Float[np.ndarray, "blocks"]
+    LossesFrom = Callable[[Trajectory], Losses | None]
+
 _CERTAIN = 3.0
-_STEP_PX = 0.1
+_USUAL_TIMES, _MUCH_WORSE = 3.0, 1.1
+_ASKED_PX, _LEAST_DEVIATIONS = 2.0, 0.25
+_SOME_RAYS = 512
+# Name, axis turned about, axis shifted along, and the shift's sign: right, down and forward are 0, 1 and 2.
+_BAS_RELIEFS = (
+    ("a turn about the vertical with a shift sideways", 1, 0, -1.0),
+    ("a tilt with a shift up or down", 0, 1, 1.0),
+)
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A turn that goes with a shift, so that the image hardly moves, by as much as events cannot tell."""
+
+    name: str
+    turn_deg: float
+    """Root mean square over the keyframes, one standard deviation."""
+    shift: float
+    """What goes with it, in the unit of the trajectory."""
+
+    def __str__(self) -> str:
+        return f"least certain is {self.name}: {self.turn_deg:.2g} deg with {self.shift:.2g}, one standard deviation"
 
 
 @dataclass(frozen=True)
 class Support:
-    """How well held-out events are predicted from either trajectory, and what that says."""
+    """How well held-out events are predicted from the trajectory as given and as refined, and what that says."""
 
     loss_given: float
     loss_refined: float
@@ -41,6 +66,7 @@ class Support:
     worse_at_s: tuple[float, ...]
     """Middles of the stretches of time, in seconds on the clock of the events, that are much better predicted from the
     trajectory given."""
+    weakest: WeakDirection | None
 
     @property
     def verdict(self) -> Literal["better", "alike", "worse"]:
@@ -57,107 +83,81 @@ class Support:
         }[self.verdict]
         losses = f"loss {self.loss_refined:.3g}, {self.loss_given:.3g} with the one given"
         where = ", ".join(f"{one:g} s" for one in self.worse_at_s)
-        return f"{said} ({losses}, {abs(self.deviations):.1f} deviations)" + (f"; worse about {where}" if where else "")
+        lines = [
+            f"{said} ({losses}, {abs(self.deviations):.1f} deviations)" + (f"; worse about {where}" if where else "")
+        ]
+        return "\n".join([*lines, *([str(self.weakest)] if self.weakest else [])])
 
 
 def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: int) -> Support | None:
-    """Compare the trajectory as ``model`` refined it with the one given; None if a number is not finite."""
+    """Ask held-out events by coarse fields of so many steps each; None if a number is not finite."""
     keyframes = model.camera_optimizer
-    refined = keyframes.trajectory()
-    offset_us = int(refined.t_us[0] - keyframes.given_trajectory().t_us[0])
-    given = _losses(model, keyframes.initial(), 0, False, datamanager, steps, seed)
-    better = _losses(model, refined.poses, offset_us, True, datamanager, steps, seed)
-    if given is None or better is None:
+    given = Trajectory(keyframes.keyframe_t_us - keyframes.clock_offset_us, keyframes.initial())
+    losses_from = partial(_losses, model, datamanager, steps, seed)
+    loss_given, loss_refined = losses_from(given, given_camera=True), losses_from(keyframes.trajectory())
+    if loss_given is None or loss_refined is None:
         return None
-    difference = better - given
-    blocks = datamanager.heldout_blocks
-    usual = np.nanmedian(np.abs(difference))
-    worse = np.flatnonzero((difference > 3 * usual) & (better > 1.1 * given))
+    difference = loss_refined - loss_given
+    worse = difference > _USUAL_TIMES * np.nanmedian(np.abs(difference))
+    worse &= loss_refined > _MUCH_WORSE * loss_given
     return Support(
-        float(np.nanmean(given)), float(np.nanmean(better)), gain(given, better), tuple(map(blocks.middle_s, worse))
+        float(np.nanmean(loss_given)),
+        float(np.nanmean(loss_refined)),
+        gain(loss_given, loss_refined),
+        tuple(map(datamanager.heldout_blocks.middle_s, np.flatnonzero(worse).tolist())),
+        _weakest(model, _median_depth(model, datamanager), loss_refined, losses_from),
     )
 
 
 def _losses(
     model: EbarfModel,
-    poses: Poses,
-    offset_us: int,
-    with_intrinsics: bool,
     datamanager: EventDataManager,
     steps: int,
     seed: int,
-) -> Float[np.ndarray, "blocks"] | None:
+    trajectory: Trajectory,
+    given_camera: bool = False,
+) -> Losses | None:
     coarse = coarse_model(model, "off")
     keyframes = coarse.camera_optimizer
-    keyframes.begin_from(poses)
-    keyframes.shift_clock(offset_us - int(keyframes.clock_offset_us))
-    if with_intrinsics and coarse.intrinsics and model.intrinsics:
-        coarse.intrinsics.load_state_dict(model.intrinsics.state_dict())
+    keyframes.begin_from(trajectory.poses)
+    keyframes.shift_clock(int(trajectory.t_us[0] - keyframes.keyframe_t_us[0]))
+    if coarse.intrinsics and given_camera:
+        torch.nn.init.zeros_(coarse.intrinsics.correction)
     return heldout_losses(coarse, CoarseTraining(coarse, datamanager, steps, seed))
 
 
-@dataclass(frozen=True)
-class WeakDirection:
-    """The motion of a keyframe that events tell worst, one standard deviation of it."""
+def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from: LossesFrom) -> WeakDirection | None:
+    """Which of two motions that a young field mistakes for relief is told worst (the bas-relief ambiguity, Belhumeur,
+    Kriegman and Yuille 1999): the camera turns as it moves aside, or tilts as it moves up, and shifts back by as much.
 
-    turn_deg: tuple[float, float, float]
-    """About the camera's axes: right, down, forward."""
-    shift: tuple[float, float, float]
-    """Along them, in the unit of the trajectory."""
-    times_worse: float
-    """Its standard deviation over that of what is told best, both as motion of the image at unit distance."""
-
-    def __str__(self) -> str:
-        turn, shift = np.array(self.turn_deg), np.array(self.shift)
-        about, along = int(np.abs(turn).argmax()), int(np.abs(shift).argmax())
-        return (
-            f"least certain is {_TURNS[about]} with a shift {_SHIFTS[along]}: no better than "
-            f"{np.linalg.norm(turn):.2g} deg with {np.linalg.norm(shift):.2g} for each keyframe"
-        )
-
-
-_TURNS = ("a turn about the horizontal", "a turn about the vertical", "a roll")
-_SHIFTS = ("sideways", "up or down", "forward")
+    From the trajectory moved so by two pixels, held-out events are predicted worse by z standard deviations. Losses
+    grow as squares do, so that the motion of one deviation is smaller by the square root of z.
+    """
+    refined = model.camera_optimizer.trajectory()
+    position, quat_wxyz = refined.poses
+    upright = quat_wxyz[:1] * quat_wxyz.new_tensor([1.0, -1, -1, -1])
+    place = rotate(upright.expand_as(quat_wxyz), position - position.mean(dim=0))
+    turn_rad, found = _ASKED_PX * model.camera_optimizer.pixel_rad, []
+    for name, turned, shifted, sign in _BAS_RELIEFS:
+        size = place[:, shifted].square().mean().sqrt()
+        course = turn_rad * place[:, shifted] / size.clamp_min(1e-9)
+        move = torch.zeros(len(course), 6).to(course)
+        move[:, turned], move[:, 3 + shifted] = course, sign * depth * course
+        moved = losses_from(Trajectory(refined.t_us, corrected(refined.poses, move)))
+        if moved is None or not float(size) > 0:
+            return None
+        found.append((turn_rad / max(gain(moved, loss_refined), _LEAST_DEVIATIONS) ** 0.5, name))
+    turn_rad, name = max(found)
+    scale = model.kwargs["metadata"]["normalization"].scale
+    return WeakDirection(name, round(float(np.degrees(turn_rad)), 4), round(turn_rad * depth / scale, 6))
 
 
 @torch.no_grad()
-def weak_direction(model: EbarfModel, datamanager: EventDataManager, scale: float) -> WeakDirection | None:
-    """The direction of a keyframe's six numbers that events tell worst, and how well at best; None if nothing tells.
-
-    By the bound of Cramér and Rao: residuals r of held-out pairs have the slopes J to the later pose, of which each
-    keyframe has n = events / keyframes. The covariance is mean(r²) mean(J Jᵀ)⁻¹ / n, in pixels of a correction. The
-    field counts as known, which it is not: what bends it along with the trajectory is worse. ``scale`` is that of the
-    training coordinates over the trajectory's unit.
-    """
-    keyframes = model.camera_optimizer
-    rays, batch = datamanager.next_eval(0)
-    t_us, seen = rays.metadata["event_t_us"][:, 0], rays.directions
-    if model.intrinsics:
-        seen = model.intrinsics.bearings(rays.metadata["event_pixel"][:, 0])
-    poses = keyframes.poses_at(t_us)
-    half = len(t_us) // 2
-    was_training = model.training
-    model.eval()
-    moves = torch.cat([torch.zeros(1, 6), _STEP_PX * torch.eye(6)]).to(seen)
-    looks = []
-    for move in moves:
-        moved = corrected(poses, (keyframes.pixel_rad * move).expand(len(t_us), 6))
-        rendered = model.renderer(Rays(moved.position, rotate(moved.quat_wxyz, seen)))
-        looks.append(log_brightness(rendered.intensity, model.config.brightness).double())
-    model.train(was_training)
-    after = torch.stack([look[half:] for look in looks])
-    change = after[0] - looks[0][:half]
-    reported = reported_change(batch["polarity_sum"], batch["event_count"], *model.sensor()).to(change)
-    slope = ((after[1:] - after[0]) / _STEP_PX).T
-    variance = (change - reported).square().mean()
-    events = len(datamanager.index.events) / len(keyframes.keyframe_t_us)
-    information = slope.T @ slope / len(slope) * events / variance
-    told, direction = torch.linalg.eigh(information)
-    if not bool(told.isfinite().all()) or not float(told[0]) > 0:
-        return None
-    worst = (direction[:, 0] / told[0].sqrt()).cpu().numpy() * keyframes.pixel_rad
-    return WeakDirection(
-        tuple(np.degrees(worst[:3]).tolist()),
-        tuple((worst[3:] / scale).tolist()),
-        float((told[-1] / told[0]).sqrt()),
-    )
+def _median_depth(model: EbarfModel, datamanager: EventDataManager) -> float:
+    """Of what held-out events see, in training coordinates."""
+    rays, _ = datamanager.next_eval(0)
+    every = max(1, len(rays) // _SOME_RAYS)
+    assert rays.metadata is not None
+    poses = model.camera_optimizer.poses_at(rays.metadata["event_t_us"][::every, 0])
+    seen = Rays(poses.position, rotate(poses.quat_wxyz, rays.directions[::every]))
+    return float(model.renderer(seen).depth.median())

@@ -47,7 +47,6 @@ from ebarf_ns.scene import Scene, check_bounds, read_scene, write_camera
 _SKIPPED_IN_A_ROW, _BELIEVED = 10, 2
 _KNOWN, _BEYOND_REASON = 20, 1e4
 _SAMPLES_OF_EVENTS = 64
-_CLOCK_AT = (0.2, 0.4)
 _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
 _LEAST = {
     "machine.seed": 0,
@@ -414,8 +413,6 @@ class EbarfTrainer(Trainer):
         self.event_pairs += self.pipeline.datamanager.get_train_rays_per_batch() // 2 * self.world_size
         self.pipeline.record_cost(self.train_seconds, self.event_pairs)
         after = self.progress()
-        if any(before < share <= after for share in _CLOCK_AT):
-            self._set_clock()
         self.last_loss = float(result[0].detach())
         if after >= 1:
             # Evaluation may fail, or take long: what was learned is safe before.
@@ -425,15 +422,6 @@ class EbarfTrainer(Trainer):
         if after >= 1:
             self.stop_training = True
         return result
-
-    def _set_clock(self) -> None:
-        """Where the clock is learned, give it what the corrections have taken on of it: they cost, and it does not."""
-        keyframes = self.pipeline.model.camera_optimizer
-        if self.alignment and not self.alignment.taken and keyframes.learns_clock:
-            offset = keyframes.remaining_clock_offset()
-            if offset.certain:
-                keyframes.explain_by_clock(offset.offset_us)
-                self.pipeline.datamanager.shift_clock(int(keyframes.clock_offset_us))
 
     def _average(self) -> None:
         """Let the mean of the parameters follow: over the last tenth of the steps, over ``averaged_steps`` at most."""
@@ -491,7 +479,7 @@ class EbarfTrainer(Trainer):
             "peak_memory_mib": round(peak_memory_mib(self.device), 1),
         }
         if support_found:
-            record["support"] = {"verdict": support_found.verdict, **asdict(support_found)}
+            record["support"] = {"verdict": support_found.verdict, "says": str(support_found), **asdict(support_found)}
         self._record_metrics(record)
         numbers = {name: value for name, value in results.items() if isinstance(value, float)}
         writer.put_dict(name="Evaluation", scalar_dict=numbers, step=step)

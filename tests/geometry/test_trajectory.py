@@ -7,7 +7,15 @@ from scipy.interpolate import BarycentricInterpolator, make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix
-from ebarf_ns.geometry.trajectory import Interpolation, Poses, corrected, interpolate, within_span
+from ebarf_ns.geometry.trajectory import (
+    Interpolation,
+    Poses,
+    Trajectory,
+    corrected,
+    densified,
+    interpolate,
+    within_span,
+)
 
 
 def keyframes(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, Poses]:
@@ -126,3 +134,22 @@ def test_a_delay_is_an_earlier_time_and_has_its_gradient(kind: Interpolation):
     assert torch.isfinite(slope).all()
     away = (at_us - delay_us - t_us[:, None]).abs().amin(dim=0) > 3
     assert torch.allclose(slope[away], numerical[away], rtol=1e-3, atol=1e-9)
+
+
+@given(st.integers(0, 50), st.integers(2, 9), st.integers(1, 100_000), st.sampled_from(["linear", "cubic"]))
+def test_poses_are_inserted_on_the_path_and_those_given_stay(seed: int, count: int, gap_us: int, kind: Interpolation):
+    t_us, poses = keyframes(count, seed)
+    dense, given_at = densified(Trajectory(t_us, poses), gap_us + 500, kind)
+    assert int(dense.t_us.diff().min()) > 0 and int(dense.t_us.diff().max()) <= gap_us + 501
+    assert torch.equal(dense.t_us[given_at], t_us)
+    assert torch.equal(dense.poses.position[given_at], poses.position)
+    assert torch.equal(dense.poses.quat_wxyz[given_at], poses.quat_wxyz)
+    between = interpolate(t_us, poses, dense.t_us, kind)
+    assert torch.allclose(dense.poses.position, between.position, atol=1e-12)
+
+
+def test_no_pose_is_inserted_where_none_is_asked_for():
+    t_us, poses = keyframes(5)
+    for gap_us in (0, 10**9):
+        dense, given_at = densified(Trajectory(t_us, poses), gap_us, "linear")
+        assert torch.equal(dense.t_us, t_us) and given_at.tolist() == [0, 1, 2, 3, 4]
