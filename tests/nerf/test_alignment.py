@@ -39,7 +39,8 @@ def ready_trainer(folder: Path, errors: TrajectoryErrors, duration_s: float = 1.
     )
     scene = simulate(made, folder / "scene").folder
     chosen = config(scene, folder / "run")
-    model, chosen.pipeline.datamanager.train_num_rays_per_batch = chosen.pipeline.model, 1024  # pyright: ignore[reportAttributeAccessIssue]
+    model, datamanager = chosen.pipeline.model, chosen.pipeline.datamanager
+    datamanager.train_num_rays_per_batch, datamanager.eval_num_rays_per_batch = 1024, 8192  # pyright: ignore[reportAttributeAccessIssue]
     model.grid_table_size_log2, model.grid_levels, model.grid_finest = 13, 6, 128  # pyright: ignore[reportAttributeAccessIssue]
     return trainer(chosen), scene
 
