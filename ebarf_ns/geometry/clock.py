@@ -61,6 +61,10 @@ def clock_offset(
     is left over is correlated from keyframe to keyframe, and so has fewer degrees of freedom than numbers.
     Offsets of up to a quarter of the trajectory's span are looked for.
     """
+    # The best of several least squares solvers is there on the CPU alone.
+    given, found = (
+        Trajectory(one.t_us.cpu(), Poses(*(column.cpu() for column in one.poses))) for one in (given, found)
+    )
     if len(given.t_us) < _FEWEST:
         return ClockOffset(0, inf, 0.0, 1.0)
     most_us = _MOST_SHARE * float(given.t_us[-1] - given.t_us[0])

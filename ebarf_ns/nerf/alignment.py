@@ -42,7 +42,7 @@ _WARM_UP = 5
 _CLOCK_EVERY, _LEAST_CLOCK_PX = 100, 0.2
 # What the rate of events says of the clock is looked into when it says a lot.
 _LEAST_ACTIVITY_US, _LEAST_ALIKE, _LEAST_GAIN = 40_000, 0.5, 0.05
-_SOME_BEARINGS = 50
+_SOME_BEARINGS, _SOME_EVENTS = 50, 5_000_000
 _CLOCK_STEPS, _CLOCK_DEVIATIONS = 100, 3.0
 
 
@@ -118,7 +118,8 @@ def _set_clock_by_activity(model: EbarfModel, datamanager: EventDataManager, see
     keyframes = model.camera_optimizer
     some = datamanager.bearings[:: max(1, len(datamanager.bearings) // _SOME_BEARINGS)]
     kind = keyframes.config.interpolation or "linear"
-    event_t_us = datamanager.index.events["t_us"]
+    events = datamanager.index.events
+    event_t_us = events["t_us"][:: max(1, len(events) // _SOME_EVENTS)]
     offset_us, alike, now = offset_by_activity(event_t_us, keyframes.start_trajectory(), some, kind)
     says_a_lot = abs(offset_us) >= _LEAST_ACTIVITY_US and alike > _LEAST_ALIKE and alike - now > _LEAST_GAIN
     if says_a_lot and _is_better(model, datamanager, offset_us, seed):

@@ -64,6 +64,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
             mode=mode,
             smooth=False,
             align_steps=0,
+            longest_gap_us=0,
             keyframe_stride=1,
             prior=0.0,
             every=1,

@@ -78,6 +78,7 @@ _LEAST = {
     "pipeline.model.render_variance": 0,
     "pipeline.model.near": 1e-6,
     "pipeline.model.samples": 1,
+    "pipeline.model.camera_optimizer.longest_gap_us": 0,
     "pipeline.model.camera_optimizer.keyframe_stride": 1,
     "pipeline.model.camera_optimizer.prior": 0,
     "pipeline.model.camera_optimizer.every": 1,
@@ -279,6 +280,9 @@ class EbarfTrainer(Trainer):
         facts = identify_recording(file, (int(trajectory.t_us[0]), int(trajectory.t_us[-1])), refractory_us)
         device = "cuda" if self.device.startswith("cuda") else "cpu"
         model: Any = self.config.pipeline.model
+        if model.camera_optimizer.mode == "off" and model.camera_optimizer.longest_gap_us is None:
+            # A trajectory that stays as it came needs no keyframes to be learned.
+            model.camera_optimizer.longest_gap_us = 0
         start = model.camera_optimizer.start(trajectory)
         normalized = model.loss == "normalized"
         lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized, facts)
@@ -295,8 +299,8 @@ class EbarfTrainer(Trainer):
         started = monotonic()
         self.alignment = align(model, self.pipeline.datamanager, steps, self.config.machine.seed, most_seconds)
         if self.world_size > 1:
-            for start in model.camera_optimizer.buffers():
-                torch.distributed.broadcast(start, 0)
+            for found in (*model.camera_optimizer.buffers(), *(one.data for one in model.pose_parameters())):
+                torch.distributed.broadcast(found, 0)
             self.pipeline.datamanager.shift_clock(int(model.camera_optimizer.clock_offset_us))
         self.train_seconds = self._agreed(monotonic() - started)
         CONSOLE.print(str(self.alignment or "no large error of the trajectory was looked for in this budget"))

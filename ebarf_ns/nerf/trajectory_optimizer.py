@@ -86,8 +86,8 @@ class TrajectoryOptimizer(CameraOptimizer):
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
         self.pixel_rad = 1 / focal_px
-        start, kind, gap_us = config.start(keyframes), config.interpolation or "linear", config.longest_gap_us or 0
-        start, _ = densified(start, gap_us, kind)
+        kind, gap_us = config.interpolation or "linear", config.longest_gap_us or 0
+        start, _ = densified(config.start(keyframes), gap_us, kind)
         keyframes, given = densified(keyframes, gap_us, kind)
         self.register_buffer("given", given, persistent=False)
         """Which of the keyframes came with the scene; the others are inserted."""

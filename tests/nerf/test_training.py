@@ -418,3 +418,22 @@ def test_a_step_in_which_no_group_is_due_is_not_a_broken_one():
     optimizers = GuardedOptimizers({}, {})
     optimizers.optimizer_scaler_step_some(torch.amp.GradScaler(enabled=False), [])
     assert optimizers.skipped == 0
+
+
+def test_learned_intrinsics_are_written_as_scene_json_has_them_and_learned_on_when_resumed(
+    tiny_scene: Path, tmp_path: Path
+):
+    made = config(tiny_scene, tmp_path)
+    made.learn_intrinsics = True
+    ready = trainer(made)
+    ready.train()
+    given = json.loads((tiny_scene / "scene.json").read_text())["camera"]
+    refined = json.loads((ready.base_dir / "camera_refined.json").read_text())
+    assert refined.keys() == given.keys() and refined["width"] == given["width"]
+    assert 0 < abs(refined["fx"] / given["fx"] - 1) < 0.05
+    assert refined["fx"] / refined["fy"] == pytest.approx(given["fx"] / given["fy"])
+    more = config(tiny_scene, tmp_path, steps=16)
+    more.learn_intrinsics, more.load_dir = True, ready.checkpoint_dir
+    resumed = trainer(more)
+    assert resumed.pipeline.model.intrinsics
+    assert resumed.pipeline.model.intrinsics.refined().fx == pytest.approx(refined["fx"], rel=1e-3)
