@@ -9,8 +9,9 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from ebarf_ns.nerf.datamanager import EventDataManagerConfig
 from ebarf_ns.nerf.model import EbarfModelConfig
+from ebarf_ns.nerf.optimizers import BudgetDecayConfig, FusedAdamConfig, KeyframeAdamConfig
 from ebarf_ns.nerf.pipeline import EbarfPipelineConfig
-from ebarf_ns.nerf.trainer import BudgetDecayConfig, EbarfTrainerConfig, FusedAdamConfig, KeyframeAdamConfig
+from ebarf_ns.nerf.trainer import EbarfTrainerConfig
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizerConfig
 
 
@@ -71,7 +72,7 @@ def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConf
             interpolation="linear",
         ),
         loss="normalized",
-        outliers_from=None,
+        huber_delta=None,
         render_variance=0.0,
         threshold_ratio=1.0,
         threshold_deviation=0.0,

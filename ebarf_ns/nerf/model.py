@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from math import sqrt
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 import tyro
@@ -52,7 +52,7 @@ class EbarfModelConfig(ModelConfig):
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
     loss: Literal["threshold", "normalized"] = "threshold"
     """Eq. 5, with thresholds taken as equal where the scene does not give them; or the paper's Eq. 6."""
-    outliers_from: float | None = 0.3
+    huber_delta: Annotated[float | None, tyro.conf.arg(aliases=["--pipeline.model.outliers-from"])] = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     render_variance: float = 5.0
     """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
@@ -239,7 +239,7 @@ class EbarfModel(Model):
                 nearest_allowed(change, reported, batch["silent"], *outputs["sensor"]),
                 batch["variance"].to(change),
                 self.mean_threshold,
-                self.config.outliers_from,
+                self.config.huber_delta,
                 self.config.render_variance,
             )
         losses = {"event_loss": loss}

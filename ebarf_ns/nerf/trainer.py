@@ -1,6 +1,5 @@
 """Training within a budget of steps or seconds, with every evaluation on record and nothing half written."""
 
-import json
 import math
 import platform
 import signal
@@ -8,8 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import cached_property, reduce
-from hashlib import sha256
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from time import monotonic
@@ -17,15 +15,11 @@ from typing import Any
 
 import torch
 import yaml
-from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
-from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from ebarf_ns.errors import TrainingError, one_line_errors
 from ebarf_ns.evaluation.report import write_report
@@ -36,151 +30,17 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.checkpoints import newest_whole, not_finite, read_checkpoint, write_checkpoint
-from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
+from ebarf_ns.nerf.metrics_file import begin_metrics, config_digest, read_header, record_metrics, scene_digest
+from ebarf_ns.nerf.optimizers import BudgetDecay, GuardedOptimizers
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.run_folder import take_folder
+from ebarf_ns.nerf.settings_check import check_settings
 from ebarf_ns.nerf.support import Support, support
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
 from ebarf_ns.scene import Scene, check_bounds, read_scene, write_camera
 
-_SKIPPED_IN_A_ROW, _BELIEVED = 10, 2
-_KNOWN, _BEYOND_REASON = 20, 1e4
-_SAMPLES_OF_EVENTS = 64
 _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
-_LEAST = {
-    "machine.seed": 0,
-    "pipeline.datamanager.train_num_rays_per_batch": 2,
-    "pipeline.datamanager.eval_num_rays_per_batch": 2,
-    "pipeline.datamanager.longest_pair": 1,
-    "pipeline.datamanager.silent_share": 0,
-    "pipeline.datamanager.refractory_us": 0,
-    "pipeline.datamanager.blank_share": 0,
-    "pipeline.datamanager.doubles_us": 0,
-    "pipeline.model.threshold_ratio": 1e-3,
-    "pipeline.model.threshold_deviation": 0,
-    "pipeline.model.threshold_prior": 0,
-    "pipeline.model.time_constant_us": 0,
-    "pipeline.model.time_constant_prior": 0,
-    "pipeline.datamanager.heldout_share": 0,
-    "pipeline.datamanager.index_memory_gib": 1e-6,
-    "pipeline.model.grid_levels": 1,
-    "pipeline.model.grid_features": 1,
-    "pipeline.model.grid_coarsest": 2,
-    "pipeline.model.grid_finest": 2,
-    "pipeline.model.grid_table_size_log2": 1,
-    "pipeline.model.broad_cells": 0,
-    "pipeline.model.density_cells": 3,
-    "pipeline.model.coarse_samples": 1,
-    "pipeline.model.uniform_share": 0,
-    "pipeline.model.most_hidden": 1e-6,
-    "pipeline.model.outliers_from": 1e-3,
-    "pipeline.model.render_variance": 0,
-    "pipeline.model.near": 1e-6,
-    "pipeline.model.samples": 1,
-    "pipeline.model.camera_optimizer.longest_gap_us": 0,
-    "pipeline.model.camera_optimizer.keyframe_stride": 1,
-    "pipeline.model.camera_optimizer.prior": 0,
-    "pipeline.model.camera_optimizer.every": 1,
-    "pipeline.model.camera_optimizer.align_steps": 0,
-    "averaged_steps": 1,
-}
-
-
-@dataclass
-class FusedAdamConfig(OptimizerConfig):
-    """Adam with one pass over memory per step."""
-
-    _target: type = torch.optim.Adam
-    betas: tuple[float, float] = (0.9, 0.99)
-    fused: bool = True
-
-
-@dataclass
-class KeyframeAdamConfig(OptimizerConfig):
-    """Adam with a second moment over the six numbers of a keyframe's correction, and of whole stretches'."""
-
-    _target: type = KeyframeAdam
-    betas: tuple[float, float] = (0.9, 0.99)
-    eps: float = 1e-3
-    """Share of a keyframe's mean second moment that is added to that of every direction."""
-    coupled: bool = True
-    """Scale rotation and shift together, so that what tells them apart is followed; else each number by itself."""
-    stretches: bool = True
-    """Move stretches of the trajectory too, as drift bends them; else each keyframe for itself alone."""
-
-
-@dataclass
-class BudgetDecayConfig(SchedulerConfig):
-    """Exponential decay over the budget of the run, whether it is counted in steps or in seconds."""
-
-    _target: type = field(default_factory=lambda: BudgetDecayScheduler)
-    lr_final_ratio: float = 0.1
-    """Learning rate at the end over that at the start."""
-
-
-class BudgetDecay(LambdaLR):
-    """Follows ``progress``, the used fraction of the budget, which the trainer sets before every step."""
-
-    progress: float = 0.0
-
-    def __init__(self, optimizer: Optimizer, final_ratio: float):
-        super().__init__(optimizer, lambda _: float(final_ratio**self.progress))
-
-
-class BudgetDecayScheduler(Scheduler):
-    """Makes :class:`BudgetDecay`."""
-
-    config: BudgetDecayConfig
-
-    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> BudgetDecay:
-        """The scheduler of one optimizer."""
-        return BudgetDecay(optimizer, self.config.lr_final_ratio)
-
-
-class GuardedOptimizers(Optimizers):
-    """Steps all groups, or none where any gradient is not finite, or 10,000 times its usual norm.
-
-    One bad batch must not poison Adam's moments, which forget slowly. Gradients that stay so large are taken from the
-    third on: then that is their norm.
-    """
-
-    skipped = 0
-    skipped_in_a_row = 0
-    usual: Tensor | None = None
-    """Running mean of the norm of each parameter's gradient, and the number of gradients, up to 99."""
-
-    def _trusted(self, parameters: list[nn.Parameter]) -> bool:
-        zero = torch.zeros((), device=parameters[0].device)
-        norms = torch.stack([zero if one.grad is None else one.grad.float().norm() for one in parameters])
-        if self.usual is None or self.usual.shape[1] != len(parameters):
-            self.usual = torch.zeros(2, len(parameters))
-        usual, count = self.usual.to(norms)
-        finite = bool(norms.isfinite().all())
-        beyond = (count >= _KNOWN) & (norms > _BEYOND_REASON * usual)
-        if finite and (self.skipped_in_a_row >= _BELIEVED or not bool(beyond.any())):
-            seen = norms > 0
-            usual = usual.where(~seen, usual.lerp(norms, 1 / (count + 1).clamp(max=100)))
-            self.usual = torch.stack([usual, (count + seen).clamp(max=99)])
-            return True
-        return False
-
-    def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
-        """Raises :class:`TrainingError` when too many steps in a row had to be skipped."""
-        parameters = [parameter for group in param_groups for parameter in self.parameters[group]]
-        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        # A gradient scaler looks for overflow itself, and lowers its scale when it finds it. Accumulating gradients, no
-        # group may be due.
-        if grad_scaler.is_enabled() or not gradients or self._trusted(parameters):
-            # A step in which the keyframes do not learn says nothing of their gradients.
-            if all(one.grad is not None for one in self.parameters.get("camera_opt", ())):
-                self.skipped_in_a_row = 0
-            super().optimizer_scaler_step_some(grad_scaler, param_groups)
-            return
-        self.skipped += 1
-        self.skipped_in_a_row += 1
-        if self.skipped_in_a_row >= _SKIPPED_IN_A_ROW:
-            raise TrainingError(f"{_SKIPPED_IN_A_ROW} training steps in a row had gradients that are not finite")
 
 
 @dataclass
@@ -224,11 +84,7 @@ class EbarfTrainer(Trainer):
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         self.config.pipeline.model.learn_intrinsics = self.config.learn_intrinsics  # pyright: ignore[reportAttributeAccessIssue]
         with one_line_errors():
-            for flag in ("max_num_iterations", "max_train_seconds"):
-                value = getattr(self.config, flag)
-                if value is not None and not value > 0:
-                    raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected more than 0")
-            self._check_settings()
+            check_settings(self.config)
             self._take_folder()
             try:
                 self._plan()
@@ -252,19 +108,6 @@ class EbarfTrainer(Trainer):
         loaded = self._loaded_path
         goes_on = loaded is not None and loaded.parent.resolve() == (self.base_dir / "nerfstudio_models").resolve()
         self.lock = take_folder(self.base_dir, goes_on, self.config.overwrite)
-
-    def _check_settings(self) -> None:
-        for flag, least in _LEAST.items():
-            value = reduce(getattr, flag.split("."), self.config)
-            if value is not None and not value >= least:
-                raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
-        pipeline: Any = self.config.pipeline
-        silent = pipeline.datamanager.silent_share
-        if silent and pipeline.model.loss == "normalized":
-            raise TrainingError(
-                f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
-                "Eq. 6 has no unit for what silence allows"
-            )
 
     def _plan(self) -> None:
         """Fill in what the configuration leaves to the plan, and keep it with the run."""
@@ -318,10 +161,7 @@ class EbarfTrainer(Trainer):
         return [resumed.get(line.field, line) for line in lines]
 
     def _header_of_resumed_run(self) -> dict[str, Any]:
-        kept = self._loaded_path.parent.parent / "metrics.jsonl" if self._loaded_path else None
-        if kept is None or not kept.is_file():
-            return {}
-        return json.loads(kept.read_text(encoding="utf-8").splitlines()[0])
+        return read_header(self._loaded_path.parent.parent) if self._loaded_path else {}
 
     def _check_scene_is_that_of_resumed_run(self, scene: Scene) -> None:
         before, now = self._header_of_resumed_run().get("scene_digest"), scene_digest(scene)
@@ -484,7 +324,7 @@ class EbarfTrainer(Trainer):
         }
         if support_found:
             record["support"] = {"verdict": support_found.verdict, "says": str(support_found), **asdict(support_found)}
-        self._record_metrics(record)
+        record_metrics(self.base_dir, record)
         numbers = {name: value for name, value in results.items() if isinstance(value, float)}
         writer.put_dict(name="Evaluation", scalar_dict=numbers, step=step)
         shown = "  ".join(f"{name} {value:.4g}" for name, value in numbers.items())
@@ -513,24 +353,8 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def _begin_metrics(self) -> None:
-        """Initial trajectory and header first; a run that goes on in its own folder keeps what is there."""
         write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
-        path = self.base_dir / "metrics.jsonl"
-        goes_on = self._start_step and path.is_file()
-        lines = path.read_text(encoding="utf-8").splitlines() if goes_on else [json.dumps(self._header())]
-        header, *records = lines
-        # What was evaluated after the checkpoint will be again.
-        records = [record for record in records if json.loads(record)["step"] <= self._start_step]
-        with whole_file(path) as temporary:
-            temporary.write_text("\n".join([header, *records]) + "\n", encoding="utf-8")
-
-    @check_main_thread
-    def _record_metrics(self, record: dict[str, Any]) -> None:
-        # All of it anew: what ends a run in the middle of a line would leave a file that nothing reads.
-        path = self.base_dir / "metrics.jsonl"
-        before = path.read_text(encoding="utf-8") if path.is_file() else ""
-        with whole_file(path) as temporary:
-            temporary.write_text(before + json.dumps(record) + "\n", encoding="utf-8")
+        begin_metrics(self.base_dir, self._header, self._start_step)
 
     def _header(self) -> dict[str, Any]:
         device = torch.cuda.get_device_name() if self.device.startswith("cuda") else platform.processor() or "cpu"
@@ -548,7 +372,7 @@ class EbarfTrainer(Trainer):
             "seed": self.config.machine.seed,
             "scene": str(scene.folder.resolve()),
             "scene_digest": scene_digest(scene),
-            "config_digest": _digest(json.dumps(configuration, default=_named).encode()),
+            "config_digest": config_digest(configuration),
             "hash_grid": fastest_carrier(torch.zeros(0, 3, device=self.device)),
             "blind_us": self.pipeline.datamanager.refractory_us,
             "hot_pixels_left_out": self.pipeline.datamanager.hot_pixels_left_out,
@@ -629,25 +453,3 @@ class EbarfTrainer(Trainer):
         if path is not None and not path.is_file():
             raise TrainingError(f"{path}: is no file, expected a run's checkpoint")
         return path
-
-
-def scene_digest(scene: Scene) -> dict[str, str]:
-    """What tells whether a scene is still the same, part by part; of the events, their size and a sample of them."""
-    size = scene.events.stat().st_size
-    events = sha256(str(size).encode())
-    with scene.events.open("rb") as file:
-        for k in range(_SAMPLES_OF_EVENTS):
-            file.seek(k * size // _SAMPLES_OF_EVENTS)
-            events.update(file.read(4096))
-    small = {"scene.json": scene.folder / "scene.json", "trajectory": scene.trajectory}
-    digests = {part: _digest(path.read_bytes()) for part, path in small.items()}
-    return {**digests, "events": events.hexdigest()[:16]}
-
-
-def _digest(content: bytes) -> str:
-    return sha256(content).hexdigest()[:16]
-
-
-def _named(value: object) -> str:
-    """Of classes and functions, whose text may hold an address."""
-    return getattr(value, "__qualname__", None) or str(value)

@@ -52,23 +52,23 @@ def threshold_loss(
     reported: Float[Tensor, "pairs"],
     variance: Float[Tensor, "pairs"],
     threshold: float,
-    outliers_from: float | None = None,
+    huber_delta: float | None = None,
     render_variance: float = 0.0,
 ) -> Float[Tensor, ""]:
     """Eq. 5 in units of the threshold, each pair weighted by one over its variance, for one event 1; 0 for no pairs.
 
     The errors of the single thresholds add up over the events of a pair, so its variance grows with their number. To
     that comes ``render_variance``, in variances of one event: what renders are wrong by however many events there are.
-    So long pairs, which tell brightness at large, weigh little less than short ones. Errors beyond ``outliers_from``
+    So long pairs, which tell brightness at large, weigh little less than short ones. Errors beyond ``huber_delta``
     standard deviations count by their size, no longer by its square (Huber 1964): what a render gets wrong at
     silhouettes must not bend the trajectory. Pairs without any event weigh no more than those of one.
     """
     deviations = ((render_variance + variance).clamp_min(1) / (render_variance + 1)).sqrt()
     error = (change - reported) / (threshold * deviations)
-    if outliers_from is None:
+    if huber_delta is None:
         cost = error * error
     else:
-        cost = 2 * torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=outliers_from)
+        cost = 2 * torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=huber_delta)
     return cost.sum() / max(len(change), 1)
 
 

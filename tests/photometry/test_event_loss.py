@@ -68,8 +68,8 @@ def test_outliers_count_by_their_size_and_small_errors_by_their_square():
     reported, variance = torch.zeros(3, dtype=torch.float64), torch.tensor([1.0, 1.0, 4.0], dtype=torch.float64)
     change = torch.tensor([0.001, 5.0, 10.0], dtype=torch.float64, requires_grad=True)
 
-    def gradient(outliers_from: float | None) -> torch.Tensor:
-        return torch.autograd.grad(threshold_loss(change, reported, variance, 0.25, outliers_from), change)[0]
+    def gradient(huber_delta: float | None) -> torch.Tensor:
+        return torch.autograd.grad(threshold_loss(change, reported, variance, 0.25, huber_delta), change)[0]
 
     plain, robust = gradient(None), gradient(0.3)
     assert robust[0] == pytest.approx(float(plain[0]))

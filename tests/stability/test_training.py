@@ -203,7 +203,7 @@ MODEL_CHANGES = {
     "loss": "normalized", "brightness": "lin_log", "intensity_range": "unit", "view_dependent": True, "grid_levels": 5,
     "grid_features": 2, "grid_coarsest": 5, "grid_finest": 40, "grid_table_size_log2": 11, "sampling": "uniform",
     "samples": 9, "coarse_samples": 64, "uniform_share": 0.5, "density_cells": 20, "near": 0.3,
-    "most_hidden": 1e-3, "outliers_from": None, "contract": True, "precision": "bfloat16", "render_variance": 20.0,
+    "most_hidden": 1e-3, "huber_delta": None, "contract": True, "precision": "bfloat16", "render_variance": 20.0,
     "broad_cells": 0, "threshold_ratio": 1.3,
 }  # fmt: skip
 POSE_CHANGES = {"smooth": False, "interpolation": "cubic", "mode": "off", "keyframe_stride": 3}

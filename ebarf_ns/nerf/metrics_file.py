@@ -1,0 +1,66 @@
+"""``metrics.jsonl`` of a run: a header, then one line for each evaluation; and what it knows its scene by."""
+
+import json
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from ebarf_ns.files import whole_file
+from ebarf_ns.scene import Scene
+
+_NAME = "metrics.jsonl"
+_SAMPLES_OF_EVENTS = 64
+
+
+def begin_metrics(run: Path, header: Callable[[], dict[str, Any]], start_step: int) -> None:
+    """Write the header; a run that goes on in its own folder keeps what was evaluated up to ``start_step``."""
+    path = run / _NAME
+    goes_on = start_step and path.is_file()
+    first, *records = path.read_text(encoding="utf-8").splitlines() if goes_on else [json.dumps(header())]
+    # What was evaluated after the checkpoint will be again.
+    records = [record for record in records if json.loads(record)["step"] <= start_step]
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join([first, *records]) + "\n", encoding="utf-8")
+
+
+def record_metrics(run: Path, record: dict[str, Any]) -> None:
+    """Add a line."""
+    # All of it anew: what ends a run in the middle of a line would leave a file that nothing reads.
+    path = run / _NAME
+    before = path.read_text(encoding="utf-8") if path.is_file() else ""
+    with whole_file(path) as temporary:
+        temporary.write_text(before + json.dumps(record) + "\n", encoding="utf-8")
+
+
+def read_header(run: Path) -> dict[str, Any]:
+    """The header; empty where there is no file."""
+    path = run / _NAME
+    return json.loads(path.read_text(encoding="utf-8").splitlines()[0]) if path.is_file() else {}
+
+
+def scene_digest(scene: Scene) -> dict[str, str]:
+    """What tells whether a scene is still the same, part by part; of the events, their size and a sample of them."""
+    size = scene.events.stat().st_size
+    events = sha256(str(size).encode())
+    with scene.events.open("rb") as file:
+        for k in range(_SAMPLES_OF_EVENTS):
+            file.seek(k * size // _SAMPLES_OF_EVENTS)
+            events.update(file.read(4096))
+    small = {"scene.json": scene.folder / "scene.json", "trajectory": scene.trajectory}
+    digests = {part: _digest(path.read_bytes()) for part, path in small.items()}
+    return {**digests, "events": events.hexdigest()[:16]}
+
+
+def config_digest(configuration: dict[str, Any]) -> str:
+    """What tells whether a run was configured alike."""
+    return _digest(json.dumps(configuration, default=_named).encode())
+
+
+def _digest(content: bytes) -> str:
+    return sha256(content).hexdigest()[:16]
+
+
+def _named(value: object) -> str:
+    """Of classes and functions, whose text may hold an address."""
+    return getattr(value, "__qualname__", None) or str(value)

@@ -1,0 +1,69 @@
+"""Numbers of a run's configuration that make no sense, said in one line before anything is done."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import TYPE_CHECKING, Any
+
+from ebarf_ns.errors import TrainingError
+
+if TYPE_CHECKING:
+    from ebarf_ns.nerf.trainer import EbarfTrainerConfig
+
+_ABOVE_0 = ("max_num_iterations", "max_train_seconds")
+_LEAST = {
+    "machine.seed": 0,
+    "pipeline.datamanager.train_num_rays_per_batch": 2,
+    "pipeline.datamanager.eval_num_rays_per_batch": 2,
+    "pipeline.datamanager.longest_pair": 1,
+    "pipeline.datamanager.silent_share": 0,
+    "pipeline.datamanager.refractory_us": 0,
+    "pipeline.datamanager.blank_share": 0,
+    "pipeline.datamanager.doubles_us": 0,
+    "pipeline.model.threshold_ratio": 1e-3,
+    "pipeline.model.threshold_deviation": 0,
+    "pipeline.model.threshold_prior": 0,
+    "pipeline.model.time_constant_us": 0,
+    "pipeline.model.time_constant_prior": 0,
+    "pipeline.datamanager.heldout_share": 0,
+    "pipeline.datamanager.index_memory_gib": 1e-6,
+    "pipeline.model.grid_levels": 1,
+    "pipeline.model.grid_features": 1,
+    "pipeline.model.grid_coarsest": 2,
+    "pipeline.model.grid_finest": 2,
+    "pipeline.model.grid_table_size_log2": 1,
+    "pipeline.model.broad_cells": 0,
+    "pipeline.model.density_cells": 3,
+    "pipeline.model.coarse_samples": 1,
+    "pipeline.model.uniform_share": 0,
+    "pipeline.model.most_hidden": 1e-6,
+    "pipeline.model.huber_delta": 1e-3,
+    "pipeline.model.render_variance": 0,
+    "pipeline.model.near": 1e-6,
+    "pipeline.model.samples": 1,
+    "pipeline.model.camera_optimizer.longest_gap_us": 0,
+    "pipeline.model.camera_optimizer.keyframe_stride": 1,
+    "pipeline.model.camera_optimizer.prior": 0,
+    "pipeline.model.camera_optimizer.every": 1,
+    "pipeline.model.camera_optimizer.align_steps": 0,
+    "averaged_steps": 1,
+}
+
+
+def check_settings(config: EbarfTrainerConfig) -> None:
+    """Raise :class:`TrainingError` that names the flag, its value and what was expected."""
+    for flag in _ABOVE_0:
+        value = getattr(config, flag)
+        if value is not None and not value > 0:
+            raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected more than 0")
+    for flag, least in _LEAST.items():
+        value = reduce(getattr, flag.split("."), config)
+        if value is not None and not value >= least:
+            raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
+    pipeline: Any = config.pipeline
+    silent = pipeline.datamanager.silent_share
+    if silent and pipeline.model.loss == "normalized":
+        raise TrainingError(
+            f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
+            "Eq. 6 has no unit for what silence allows"
+        )
