@@ -130,7 +130,7 @@ def _distance(
     if int(inside.sum()) < _FEWEST:
         return inf, 0.0
     poses = interpolate(given.t_us, given.poses, found.t_us[inside] - offset_us, kind)
-    left = _without_gauge(poses, Poses(*(column[inside] for column in found.poses)), translation)
+    left = differences_less_similarity(poses, Poses(*(column[inside] for column in found.poses)), translation)
     power = float(left.square().sum())
     rough = float(left.diff(dim=0).square().sum()) / max(2 * power, 1e-30)
     share = left.square().sum(dim=0) / max(power, 1e-30)
@@ -139,10 +139,10 @@ def _distance(
     return power / len(left), channels * (len(left) * min((rough / pi) ** 0.5, 1.0) - 1)
 
 
-def _without_gauge(some: Poses, others: Poses, translation: float) -> Float[Tensor, "poses 6"]:
+def differences_less_similarity(some: Poses, others: Poses, translation: float = 1.0) -> Float[Tensor, "poses 6"]:
     """Rotation vectors from ``some`` to ``others`` in the world, and shifts times ``translation``, less what the best
     small similarity of the whole world does. Of uniform motion, a late clock is nothing but that."""
-    some, others = (Poses(*(column.double() for column in poses)) for poses in (some, others))
+    some, others = (Poses(*(column.double().cpu() for column in poses)) for poses in (some, others))
     centre = some.position.mean(dim=0)
     weight = torch.tensor([1.0] * 3 + [translation] * 3, dtype=torch.float64, device=centre.device)
     axes = torch.eye(3).to(centre).expand(len(some.position), 3, 3)

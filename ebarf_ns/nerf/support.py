@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import torch
 
+from ebarf_ns.geometry.clock import differences_less_similarity
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.geometry.trajectory import Trajectory, corrected
 from ebarf_ns.nerf.coarse import CoarseTraining, coarse_model, gain, heldout_losses
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     Losses = Float[np.ndarray, "blocks"]
     LossesFrom = Callable[[Trajectory], Losses | None]
 
-_CERTAIN = 3.0
+_CERTAIN = 4.0
 _USUAL_TIMES, _MUCH_WORSE = 3.0, 1.1
 _ASKED_PX, _LEAST_DEVIATIONS = 2.0, 0.25
 _SOME_RAYS = 512
@@ -50,9 +51,13 @@ class WeakDirection:
     """Root mean square over the keyframes, one standard deviation."""
     shift: float
     """What goes with it, in the unit of the trajectory."""
+    or_more: bool
+    """Whether events did not tell as much as was asked for."""
 
     def __str__(self) -> str:
-        return f"least certain is {self.name}: {self.turn_deg:.2g} deg with {self.shift:.2g}, one standard deviation"
+        more = " or more" if self.or_more else ""
+        size = f"{self.turn_deg:.2g} deg with {self.shift:.2g}{more}"
+        return f"least certain is {self.name}: {size}, one standard deviation"
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,9 @@ class Support:
     worse_at_s: tuple[float, ...]
     """Middles of the stretches of time, in seconds on the clock of the events, that are much better predicted from the
     trajectory given."""
+    shifted: float
+    """Root mean square distance of the refined positions from those given, less a similarity, in the trajectory's
+    unit."""
     weakest: WeakDirection | None
 
     @property
@@ -86,7 +94,13 @@ class Support:
         lines = [
             f"{said} ({losses}, {abs(self.deviations):.1f} deviations)" + (f"; worse about {where}" if where else "")
         ]
-        return "\n".join([*lines, *([str(self.weakest)] if self.weakest else [])])
+        if self.weakest:
+            lines.append(str(self.weakest))
+            if self.shifted < self.weakest.shift:
+                lines.append(
+                    f"positions moved by {self.shifted:.2g}, less than that: they may be no better than those given"
+                )
+        return "\n".join(lines)
 
 
 def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: int) -> Support | None:
@@ -105,6 +119,7 @@ def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: 
         float(np.nanmean(loss_refined)),
         gain(loss_given, loss_refined),
         tuple(map(datamanager.heldout_blocks.middle_s, np.flatnonzero(worse).tolist())),
+        _shifted(given, keyframes.trajectory()) / _scale(model),
         _weakest(model, _median_depth(model, datamanager), loss_refined, losses_from),
     )
 
@@ -146,10 +161,21 @@ def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from:
         moved = losses_from(Trajectory(refined.t_us, corrected(refined.poses, move)))
         if moved is None or not float(size) > 0:
             return None
-        found.append((turn_rad / max(gain(moved, loss_refined), _LEAST_DEVIATIONS) ** 0.5, name))
-    turn_rad, name = max(found)
-    scale = model.kwargs["metadata"]["normalization"].scale
-    return WeakDirection(name, round(float(np.degrees(turn_rad)), 4), round(turn_rad * depth / scale, 6))
+        found.append((gain(moved, loss_refined), name))
+    deviations, name = min(found)
+    turn_rad /= max(deviations, _LEAST_DEVIATIONS) ** 0.5
+    shift = round(turn_rad * depth / _scale(model), 6)
+    return WeakDirection(name, round(float(np.degrees(turn_rad)), 4), shift, deviations < _LEAST_DEVIATIONS)
+
+
+def _scale(model: EbarfModel) -> float:
+    """Training coordinates over the trajectory's unit."""
+    return float(model.kwargs["metadata"]["normalization"].scale)
+
+
+def _shifted(given: Trajectory, refined: Trajectory) -> float:
+    left = differences_less_similarity(given.poses, refined.poses)[:, 3:]
+    return round(float(left.square().sum(dim=-1).mean().sqrt()), 6)
 
 
 @torch.no_grad()
