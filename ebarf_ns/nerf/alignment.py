@@ -60,10 +60,12 @@ class Alignment:
     seconds: float
 
     def __str__(self) -> str:
-        clock = f"its clock is off by {self.clock_offset_us / 1000:+.1f} ms; " if self.clock_offset_us else ""
+        clock = (
+            f"clock off by {self.clock_offset_us / 1000:+.1f} ms, which is made good; " if self.clock_offset_us else ""
+        )
         if self.taken:
-            return f"the trajectory: {clock}off by {self.moved_px:.1f} px: training begins where a coarse field puts it"
-        return f"the trajectory: {clock}off by {self.moved_px:.1f} px or less: training begins from it as it is"
+            return f"trajectory: {clock}off by {self.moved_px:.1f} px, training begins where a coarse field puts it"
+        return f"trajectory: {clock}good to {self.moved_px:.1f} px, training begins from it as it is"
 
 
 def align(
