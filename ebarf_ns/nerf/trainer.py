@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, reduce
 from hashlib import sha256
 from importlib.metadata import version
@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 import yaml
+from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -36,6 +37,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.checkpoints import newest_whole, not_finite, read_checkpoint, write_checkpoint
+from ebarf_ns.nerf.dataparser import keep_scene, moved
 from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.run_folder import take_folder
@@ -203,6 +205,12 @@ class EbarfTrainerConfig(TrainerConfig):
     averaged_steps: int = 100
     """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
 
+    def save_config(self) -> None:
+        """Write config.yml, which is what ns-train begins with, unless this machine lacks what is asked of it."""
+        with one_line_errors():
+            _check_machine(self.machine)
+        super().save_config()
+
 
 class EbarfTrainer(Trainer):
     """Follows the budget, evaluates along the way, and leaves trajectories and metrics in the run's folder."""
@@ -270,6 +278,8 @@ class EbarfTrainer(Trainer):
         """Fill in what the configuration leaves to the plan, and keep it with the run."""
         datamanager = self.config.pipeline.datamanager
         folder = datamanager.data or datamanager.dataparser.data  # pyright: ignore[reportAttributeAccessIssue]
+        if datamanager.dataparser.kept and not Path(folder).is_dir():  # pyright: ignore[reportAttributeAccessIssue]
+            raise TrainingError(moved(replace(datamanager.dataparser, data=Path(folder))))  # pyright: ignore[reportAttributeAccessIssue]
         scene = read_scene(Path(folder))
         trajectory = read_tum(scene.trajectory)
         check_bounds(scene, trajectory)
@@ -287,7 +297,7 @@ class EbarfTrainer(Trainer):
         normalized = model.loss == "normalized"
         lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized, facts)
         self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
-        self._keep_plan()
+        self._keep_plan(scene)
 
     def _align(self) -> None:
         """Look for large errors of the trajectory, where a run begins and its budget allows for it."""
@@ -333,7 +343,10 @@ class EbarfTrainer(Trainer):
             )
 
     @check_main_thread
-    def _keep_plan(self) -> None:
+    def _keep_plan(self, scene: Scene) -> None:
+        kept = self.base_dir / "scene"
+        keep_scene(scene, kept)
+        self.config.pipeline.datamanager.dataparser.kept = kept  # pyright: ignore[reportAttributeAccessIssue]
         with whole_file(self.base_dir / "config.yml") as temporary:
             temporary.write_text(yaml.dump(self.config), encoding="utf-8")
 
@@ -540,6 +553,7 @@ class EbarfTrainer(Trainer):
         configuration = {key: value for key, value in asdict(self.config).items() if key not in places}
         datamanager = configuration["pipeline"]["datamanager"]
         datamanager["data"] = datamanager["dataparser"]["data"] = None
+        del datamanager["dataparser"]["kept"]
         return {
             "versions": {name: version(name) for name in ("ebarf_ns", "nerfstudio", "torch", "numpy")},
             "method": self.config.method_name,
@@ -629,6 +643,21 @@ class EbarfTrainer(Trainer):
         if path is not None and not path.is_file():
             raise TrainingError(f"{path}: is no file, expected a run's checkpoint")
         return path
+
+
+def _check_machine(machine: MachineConfig) -> None:
+    """Raise :class:`TrainingError` for devices that are not here."""
+    found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    here = [device for device, there in found.items() if there]
+    if machine.device_type not in here:
+        raise TrainingError(
+            f"--machine.device-type is {machine.device_type}, expected one that is here: {', '.join(here)}"
+        )
+    most = torch.cuda.device_count() if machine.device_type == "cuda" else 1
+    if not 1 <= machine.num_devices <= most:
+        raise TrainingError(
+            f"--machine.num-devices is {machine.num_devices}, expected 1 to {most}, as many as are here"
+        )
 
 
 def scene_digest(scene: Scene) -> dict[str, str]:
