@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+import tyro
 from jaxtyping import Float, Int64
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
@@ -61,7 +62,7 @@ class EbarfDataParserConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: EbarfDataParser)
     data: Path = Path("scene")
     """The scene folder."""
-    kept: Path | None = None
+    kept: tyro.conf.Suppress[Path | None] = None
     """What a trained run has of its scene: it is opened by that where the scene is gone. Training fills it in."""
 
 
