@@ -26,6 +26,7 @@ from tests.events import writers
 from tests.events.test_recognise import bag1, messages, types
 
 STEREO = [("sensor_msgs", "Image"), ("std_msgs", "Header"), ("builtin_interfaces", "Time")]
+COMPRESSED = [("sensor_msgs", "CompressedImage"), *STEREO[1:]]
 EVENTS: list[writers.Event] = [(t, t // 1000 % 64, t // 3000 % 48, t // 7000 % 2) for t in range(0, 2_000_000, 1000)]
 POSES = [(t, 0.1 * t / 1e6, np.sin(t / 1e6), 0.0) for t in range(0, 2_100_000, 8333)]
 TURNS = [Rotation.from_rotvec([0.1 * t / 1e6, 0.2, 0.05 * t / 1e6]) for t, *_ in POSES]
@@ -395,6 +396,25 @@ def test_frames_of_a_bag_that_are_not_taken_are_counted(
 ):
     found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels, size))
     assert not found and "left out: 2 frames of /dvs/image_raw: " in said and words in said
+
+
+@pytest.mark.parametrize(("spoilt", "count"), [(False, 2), (True, 0)])
+def test_compressed_frames_of_a_bag_are_taken(tmp_path: Path, spoilt: bool, count: int):
+    store = types(1)
+    image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in COMPRESSED)
+    data = cv2.imencode(".png", GREY.astype(np.uint8))[1]
+    with Writer1(tmp_path / "a.bag") as bag:
+        events = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        for k, message in enumerate(messages(store, EVENTS, (64, 48))):
+            bag.write(events, 10**9 + k, store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
+        kind = "sensor_msgs/msg/CompressedImage"
+        topic = bag.add_connection("/dvs/image_raw/compressed", kind, typestore=store)
+        for second in (0, 1):
+            message = image(header(0, time(second, 500_000_000), ""), "mono8; png", data[: 9 if spoilt else None])
+            bag.write(topic, 10**9 + second, store.serialize_ros1(message, kind))
+    found, said = frames_and_sentences(tmp_path, tmp_path / "a.bag")
+    assert len(found) == count and all((one == GREY).all() for one in found)
+    assert ("left out: 2 frames of /dvs/image_raw/compressed: compressed as 'mono8; png', which" in said) == spoilt
 
 
 def ecd(folder: Path) -> Path:
