@@ -77,6 +77,7 @@ class EbarfDataParser(DataParser):
         with one_line_errors():
             self.scene = read_scene(_scene_folder(config))
             self.trajectory = read_tum(self.scene.trajectory)
+            _check_scene_is_the_runs(self.scene, self.trajectory, config.kept)
             self.normalization = _normalization(self.scene, self.trajectory)
             self.mount_scale = self.normalization.scale / _reference_units(self.scene, self.trajectory)
 
@@ -147,6 +148,19 @@ def _scene_folder(config: EbarfDataParserConfig) -> Path:
         raise SceneError(moved(config))
     sys.stderr.write(f"opened by the run's own {config.kept}, without frames and recording ({moved(config)})\n")
     return config.kept
+
+
+def _check_scene_is_the_runs(scene: Scene, trajectory: Trajectory, kept: Path | None) -> None:
+    """Another scene may have come to the place of the one that a run was trained on."""
+    if kept is None or not (kept / "trajectory.txt").is_file():
+        return
+    trained = read_tum(kept / "trajectory.txt")
+    columns = zip((trajectory.t_us, *trajectory.poses), (trained.t_us, *trained.poses), strict=True)
+    if not all(torch.equal(now, then) for now, then in columns):
+        raise SceneError(
+            f"{scene.trajectory.absolute()}: {len(trajectory.t_us)} keyframes, other than the {len(trained.t_us)} of "
+            f"{(kept / 'trajectory.txt').absolute()}, expected those that the run was trained on"
+        )
 
 
 def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:

@@ -52,6 +52,19 @@ def test_a_scene_that_is_gone_is_opened_by_what_the_run_has_kept(
     assert f"{tmp_path / 'gone'}: no such folder" in said and said.count("\n") == 1
 
 
+def test_another_scene_in_the_place_of_a_runs_is_refused(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder, kept = shutil.copytree(tiny_scene, tmp_path / "scene"), tmp_path / "run" / "scene"
+    keep_scene(read_scene(folder), kept)
+    lines = (folder / "trajectory.txt").read_text().splitlines(keepends=True)
+    (folder / "trajectory.txt").write_text("".join(lines[:-2]))
+    with pytest.raises(SystemExit) as stopped:
+        EbarfDataParserConfig(data=folder, kept=kept).setup()
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and f"error: {folder / 'trajectory.txt'}: 9 keyframes, other than the 11 of" in said
+
+
 @pytest.mark.parametrize(
     ("content", "place"),
     [
