@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +36,7 @@ class FrameFile:
     """A picture that a camera took."""
 
     picture: Path | np.ndarray
-    """A file, or 8-bit grey."""
+    """A file, or grey of 8 or 16 bits."""
     t_us: int
     camera: Camera | None
     """None: the event camera itself."""
@@ -50,6 +52,8 @@ class Ingredients:
     camera: Camera | None = None
     groundtruth: Trajectory | None = None
     frames: Iterable[FrameFile] = ()
+    frames_left_out: Counter[str] = field(default_factory=Counter)
+    """Those that are not among them, by topic and reason; counted while they are read."""
     contrast_threshold: ContrastThreshold | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -132,7 +136,7 @@ def eds(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     poses, stamps = folder / "stamped_groundtruth.txt", folder / "images_timestamps.txt"
     if poses.is_file():
         groundtruth, notes = read_trajectory(poses, TrajectoryFormat("s", "xyzw"))
-    known = read_cameras(cameras) if cameras and cameras.suffix == ".yaml" else {}
+    known = read_cameras(cameras) if cameras and cameras.suffix.lower() in (".yaml", ".yml") else {}
     stamped = given.frames and stamps.is_file()
     if stamped and "cam0" in known and "cam1" in known:
         event_from_frame = np.linalg.inv(_rig(known["cam1"], cameras)) @ _rig(known["cam0"], cameras)
@@ -162,7 +166,9 @@ def robust_e_nerf(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     camera = read_calibration(calibration).camera if given.camera is None else None
     threshold = _contrast_threshold(calibration) if calibration.is_file() else None
     groundtruth, notes = read_trajectory(folder / "camera_poses.npz")
-    return Ingredients(lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, (), threshold, notes)
+    return Ingredients(
+        lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, contrast_threshold=threshold, notes=notes
+    )
 
 
 LAYOUTS: dict[Layout, Callable[[Path, Given], Ingredients]] = {
@@ -235,25 +241,34 @@ def _at_most_one(folder: Path, pattern: str) -> Path | None:
 def _listed(path: Path, unit: Literal["s", "us"]) -> list[tuple[int, Path]]:
     """Lines "time file"."""
     images = []
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    lines = _lines(path) if path.is_file() else []
     for number, line in enumerate(lines, start=1):
         fields = line.split()
         if not fields or line.startswith("#"):
             continue
         try:
             t_us = round(float(fields[0]) * (1e6 if unit == "s" else 1))
-        except ValueError:
+        except (ValueError, OverflowError):
             t_us = None
         if t_us is None or len(fields) != 2 or not (path.parent / fields[1]).is_file():
-            raise SceneError(f"{path}:{number}: {line!r:.60}, expected 't[{unit}] file' with an existing file")
+            raise SceneError(
+                f"{path}:{number}: {line!r:.60}, expected 't[{unit}] file' with an existing file, or --no-frames"
+            )
         images.append((t_us, path.parent / fields[1]))
     return images
 
 
 def _times(path: Path, count: int) -> list[int]:
     """A time in microseconds a line, after a line of names."""
-    lines = [line.split()[0] for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    lines = [line for line in lines if not line.startswith("#") and line.replace(".", "").isdigit()]
+    lines = [line.split()[0] for line in _lines(path) if line.strip()]
+    lines = [line for line in lines if re.fullmatch(r"\d+(\.\d*)?", line)]
     if len(lines) != count:
-        raise SceneError(f"{path}: {len(lines)} times, expected one for each of the {count} images")
+        raise SceneError(f"{path}: {len(lines)} times, expected one for each of the {count} images, or --no-frames")
     return [round(float(line)) for line in lines]
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: byte {error.start} is not UTF-8 text, expected times, or --no-frames") from None

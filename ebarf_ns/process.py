@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -126,12 +127,13 @@ def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ing
     known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]
     known = known or recognised(source)
     opened = lambda: open_recording(source, known, settings.part, settings.event_time_unit)  # noqa: E731
-    frames = _frames_within(source, known, opened, settings.part) if settings.frames else ()
-    return Ingredients(opened, frames=frames)
+    left_out: Counter[str] = Counter()
+    frames = _frames_within(source, known, opened, settings.part, left_out) if settings.frames else ()
+    return Ingredients(opened, frames=frames, frames_left_out=left_out)
 
 
 def _frames_within(
-    source: Path, format: RecordingFormat, opened: Callable[[], Source], part: str | None
+    source: Path, format: RecordingFormat, opened: Callable[[], Source], part: str | None, left_out: Counter[str]
 ) -> Iterator[FrameFile]:
     """The pictures that a DAVIS takes with the pixels of its events."""
     if format == "aedat4":
@@ -141,12 +143,19 @@ def _frames_within(
     elif format == "bag":
         from ebarf_ns.events.readers.bags import read_bag_frames
 
-        pictures = read_bag_frames(source, opened().sensor_size or (0, 0), part)
+        pictures = read_bag_frames(source, opened().sensor_size or (0, 0), part, left_out)
     else:
         return
     for t_us, picture in pictures:
-        grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-        yield FrameFile(grey, t_us, None, np.eye(4), "linear")
+        yield FrameFile(_grey(picture), t_us, None, np.eye(4), "linear")
+
+
+def _grey(picture: np.ndarray) -> np.ndarray:
+    """Of grey, BGR or BGRA."""
+    channels = 1 if picture.ndim == 2 else picture.shape[2]
+    if channels == 1:
+        return picture.reshape(picture.shape[:2])
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY)
 
 
 def _assemble(
@@ -178,12 +187,18 @@ def _assemble(
         groundtruth = _clipped(groundtruth, span_us, settings.groundtruth or source.path)
         write_tum(folder / "groundtruth.txt", groundtruth)
     threshold = ContrastThreshold(*settings.contrast_threshold) if settings.contrast_threshold else None
-    frames, seen = [], 0
+    frames, seen, within, left_out = [], 0, 0, ingredients.frames_left_out
     for frame in ingredients.frames if settings.frames else ():
         frame = replace(frame, t_us=frame.t_us + intake.time_offset_us)  # noqa: PLW2901
         if span_us[0] <= frame.t_us <= span_us[1]:
-            frames.append(_taken_along(frame, f"{seen:06d}", camera, folder))
+            within += 1
+            taken = _taken_along(frame, f"{seen:06d}", camera, folder)
+            if isinstance(taken, Frame):
+                frames.append(taken)
+            else:
+                left_out[taken] += 1
         seen += 1
+    notes += [f"left out: {count:,} frame{'s' * (count > 1)} of {why}" for why, count in left_out.items()]
     scene = Scene(
         folder=folder,
         events=folder / "events.h5",
@@ -195,7 +210,10 @@ def _assemble(
         bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
     )
     write_scene(scene)
-    notes.append(f"{len(initial.t_us)} keyframes around the events, {len(frames)} of {seen} frames within their span")
+    taken_along = "" if len(frames) == within else f", {len(frames)} of which are taken along"
+    notes.append(
+        f"{len(initial.t_us)} keyframes around the events, {within} of {seen} frames within their span{taken_along}"
+    )
     return report.sentences() + notes
 
 
@@ -249,18 +267,23 @@ def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tupl
     return tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
 
 
-def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> Frame:
-    """A copy: PNG where the scene can hold it as it is."""
+def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> Frame | str:
+    """A copy: PNG where the scene can hold it as it is; of what size a frame is that its camera cannot have taken."""
     picture = frame.picture
     name = picture.stem if isinstance(picture, Path) else name
+    as_it_is = isinstance(picture, Path) and picture.suffix.lower() == ".png"
+    flag = cv2.IMREAD_UNCHANGED if as_it_is else cv2.IMREAD_GRAYSCALE
+    image = cv2.imread(str(picture), flag) if isinstance(picture, Path) else picture
+    if image is None:
+        raise SceneError(f"{picture}: cannot be read as an image, expected one, or --no-frames")
+    size, of = image.shape[1::-1], frame.camera or camera
+    if size != (of.width, of.height):
+        return f"{size[0]} x {size[1]} pixels, expected their camera's {of.width} x {of.height}"
     path = folder / "frames" / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
-    if isinstance(picture, Path) and picture.suffix.lower() == ".png":
-        path.write_bytes(picture.read_bytes())
+    if as_it_is:
+        path.write_bytes(Path(picture).read_bytes())  # pyright: ignore[reportArgumentType]
     else:
-        image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE) if isinstance(picture, Path) else picture
-        if image is None:
-            raise SceneError(f"{picture}: not a readable image")
         cv2.imwrite(str(path), image)
     extrinsic = tuple(map(tuple, np.asarray(frame.event_camera_from_frame_camera, float).tolist()))
-    return Frame(path, frame.t_us, frame.camera or camera, extrinsic, frame.intensity)
+    return Frame(path, frame.t_us, of, extrinsic, frame.intensity)

@@ -26,6 +26,7 @@ from tests.events import writers
 from tests.events.test_recognise import bag1, messages, types
 
 STEREO = [("sensor_msgs", "Image"), ("std_msgs", "Header"), ("builtin_interfaces", "Time")]
+COMPRESSED = [("sensor_msgs", "CompressedImage"), *STEREO[1:]]
 EVENTS: list[writers.Event] = [(t, t // 1000 % 64, t // 3000 % 48, t // 7000 % 2) for t in range(0, 2_000_000, 1000)]
 POSES = [(t, 0.1 * t / 1e6, np.sin(t / 1e6), 0.0) for t in range(0, 2_100_000, 8333)]
 TURNS = [Rotation.from_rotvec([0.1 * t / 1e6, 0.2, 0.05 * t / 1e6]) for t, *_ in POSES]
@@ -310,9 +311,151 @@ def test_frames_of_a_bag_are_those_beside_its_events(tmp_path: Path):
         settings = ProcessSettings(
             camera=tmp_path / "camera.json", trajectory=tmp_path / "odometry.txt", part=f"/davis/{side}/events"
         )
-        process("bag", path, tmp_path / side, settings)
+        said = process("bag", path, tmp_path / side, settings)
+        topic = f"/davis/{side}/image_color: those of /davis/{side}/image_raw are taken"
+        assert f"left out: 2 frames of {topic}" in said
         pictures = [cv2.imread(str(frame.path), -1) for frame in read_scene(tmp_path / side).frames]
         assert len(pictures) == 2 and all((one == grey).all() for one in pictures if one is not None)
+
+
+GREY = np.arange(48 * 64).reshape(48, 64) % 180 + 20
+BAYER_ON = {"bayer_rggb8": (0, 0), "bayer_bggr8": (1, 1), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0)}
+"""Where the red pixels begin."""
+
+
+def image_bag(
+    path: Path, encoding: str, pixels: np.ndarray, size: tuple[int, int] = (64, 48), big: bool = False
+) -> Path:
+    """Events and two images that say of themselves what is given."""
+    store = types(1)
+    image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in STEREO)
+    with Writer1(path) as bag:
+        events = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        for k, message in enumerate(messages(store, EVENTS, (64, 48))):
+            bag.write(events, 10**9 + k, store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
+        topic = bag.add_connection("/dvs/image_raw", "sensor_msgs/msg/Image", typestore=store)
+        for second in (0, 1):
+            head, data = header(0, time(second, 500_000_000), ""), np.frombuffer(pixels.tobytes(), np.uint8)
+            message = image(head, size[1], size[0], encoding, int(big), pixels.nbytes // len(pixels), data)
+            bag.write(topic, 10**9 + second, store.serialize_ros1(message, "sensor_msgs/msg/Image"))
+    return path
+
+
+def frames_and_sentences(tmp_path: Path, bag: Path) -> tuple[list[np.ndarray], str]:
+    (tmp_path / "odometry.txt").write_text(poses("s"))
+    settings = ProcessSettings(camera=calibration(tmp_path), trajectory=tmp_path / "odometry.txt")
+    said = process("bag", bag, tmp_path / "scene", settings)
+    frames = [cv2.imread(str(frame.path), cv2.IMREAD_UNCHANGED) for frame in read_scene(tmp_path / "scene").frames]
+    assert inspect_scene(tmp_path / "scene").events == 2000
+    return [frame for frame in frames if frame is not None], " ".join(said)
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1", "bgr8", "rgb8", "bgra8", "rgba8", "bayer_rggb8", "bayer_gbrg8"])
+def test_frames_of_a_bag_are_grey_whatever_their_encoding(tmp_path: Path, encoding: str):
+    channels = {"bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}.get(encoding, 1)
+    # Of a Bayer pattern, a picture that is the same everywhere can be told.
+    grey = np.full_like(GREY, 77) if "bayer" in encoding else GREY
+    pixels = np.repeat(grey[..., None], channels, axis=-1).astype(np.uint8)
+    found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels))
+    assert len(found) == 2 and all(np.abs(one.astype(int) - grey).max() <= 1 for one in found), said
+    assert "2 of 2 frames within their span" in said and "frames of" not in said
+
+
+@pytest.mark.parametrize("encoding", [*BAYER_ON, "rgb8", "bgr8", "rgba8"])
+def test_red_is_taken_for_red(tmp_path: Path, encoding: str):
+    """It makes 30 per cent of grey, blue 11."""
+    if encoding in BAYER_ON:
+        pixels, (row, column) = np.zeros((48, 64), np.uint8), BAYER_ON[encoding]
+        pixels[row::2, column::2] = 200
+    else:
+        pixels = np.zeros((48, 64, len(encoding) - 1), np.uint8)
+        pixels[..., encoding.index("r")] = 200
+    found, _ = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels))
+    assert all(one[8:-8, 8:-8].mean() == pytest.approx(60, abs=2) for one in found) and len(found) == 2
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_sixteen_bits_of_which_ten_are_used_are_as_bright_as_they_can_be(tmp_path: Path, big: bool):
+    pixels = (5 * GREY).astype(">u2" if big else "<u2")
+    found, _ = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", "mono16", pixels, big=big))
+    assert len(found) == 2 and all((one == 5 * GREY * 2**6).all() and one.dtype == np.uint16 for one in found)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "size", "words"),
+    [
+        ("yuv422", np.zeros((48, 128), np.uint8), (64, 48), "encoded as 'yuv422', expected one of mono8, 8UC1"),
+        ("mono8", np.zeros((48, 192), np.uint8), (64, 48), "mono8 of 64 x 48 pixels in 9,216 bytes with rows of 192"),
+        ("mono8", np.zeros((30, 64), np.uint8), (64, 48), "in 1,920 bytes with rows of 64, expected 3,072"),
+        ("rgb8", np.zeros((48, 64), np.uint8), (64, 48), "expected 9,216 with rows of 192"),
+        ("mono8", np.zeros((20, 30), np.uint8), (30, 20), "30 x 20 pixels, expected the event sensor's 64 x 48"),
+    ],
+)
+def test_frames_of_a_bag_that_are_not_taken_are_counted(
+    tmp_path: Path, encoding: str, pixels: np.ndarray, size: tuple[int, int], words: str
+):
+    found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels, size))
+    assert not found and "left out: 2 frames of /dvs/image_raw: " in said and words in said
+
+
+@pytest.mark.parametrize(("spoilt", "count"), [(False, 2), (True, 0)])
+def test_compressed_frames_of_a_bag_are_taken(tmp_path: Path, spoilt: bool, count: int):
+    store = types(1)
+    image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in COMPRESSED)
+    data = cv2.imencode(".png", GREY.astype(np.uint8))[1]
+    with Writer1(tmp_path / "a.bag") as bag:
+        events = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        for k, message in enumerate(messages(store, EVENTS, (64, 48))):
+            bag.write(events, 10**9 + k, store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
+        kind = "sensor_msgs/msg/CompressedImage"
+        topic = bag.add_connection("/dvs/image_raw/compressed", kind, typestore=store)
+        for second in (0, 1):
+            message = image(header(0, time(second, 500_000_000), ""), "mono8; png", data[: 9 if spoilt else None])
+            bag.write(topic, 10**9 + second, store.serialize_ros1(message, kind))
+    found, said = frames_and_sentences(tmp_path, tmp_path / "a.bag")
+    assert len(found) == count and all((one == GREY).all() for one in found)
+    assert ("left out: 2 frames of /dvs/image_raw/compressed: compressed as 'mono8; png', which" in said) == spoilt
+
+
+def ecd(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "events.txt").write_text("".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for t, x, y, p in EVENTS))
+    (folder / "calib.txt").write_text("60 60 32 24 0 0 0 0 0")
+    (folder / "groundtruth.txt").write_text(poses("s"))
+    for k, size in enumerate([(48, 64), (48, 64), (180, 240)]):
+        (folder / "images").mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.full(size, 50 + k, np.uint8))
+    (folder / "images.txt").write_text("".join(f"0.{k + 1} images/{k}.png\n" for k in range(3)))
+    return folder
+
+
+def test_frames_of_another_size_are_left_out_and_counted(tmp_path: Path):
+    settings = ProcessSettings(sensor_size=(64, 48))
+    said = " ".join(process("ecd", ecd(tmp_path / "source"), tmp_path / "scene", settings))
+    assert "left out: 1 frame of 240 x 180 pixels, expected their camera's 64 x 48" in said
+    assert "3 of 3 frames within their span, 2 of which are taken along" in said
+    assert len(read_scene(tmp_path / "scene").frames) == 2 and inspect_scene(tmp_path / "scene").events == 2000
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("images/0.png", b"no picture", "0.png: cannot be read as an image, expected one, or --no-frames"),
+        ("images.txt", b"inf images/0.png\n", "images.txt:1: .*existing file, or --no-frames"),
+        ("images.txt", b"0.1 images/gone.png\n", "images.txt:1: .*existing file, or --no-frames"),
+        ("images.txt", b"\xff\xfe0.1", "images.txt: byte 0 is not UTF-8 text"),
+    ],
+)
+def test_frames_that_cannot_be_read_leave_no_scene_and_are_no_matter_without_frames(
+    tmp_path: Path, name: str, content: bytes, words: str
+):
+    source = ecd(tmp_path / "source")
+    (source / name).write_bytes(content)
+    with pytest.raises(SceneError, match=words):
+        process("ecd", source, tmp_path / "scene", ProcessSettings(sensor_size=(64, 48)))
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+    process("ecd", source, tmp_path / "scene", ProcessSettings(sensor_size=(64, 48), frames=False))
+    assert not read_scene(tmp_path / "scene").frames
 
 
 def stereo_bag(path: Path) -> Path:

@@ -3,11 +3,14 @@
 Kept light: nerfstudio imports this module while its own are half loaded.
 """
 
-from dataclasses import dataclass, field
+import re
+import sys
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+import tyro
 from jaxtyping import Float, Int64
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
@@ -15,16 +18,19 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from ebarf_ns.errors import one_line_errors
+from ebarf_ns.errors import SceneError, one_line_errors
+from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.scene import Frame, Scene, box_of_bounds, check_bounds, read_scene
+from ebarf_ns.scene import Frame, Scene, box_of_bounds, check_bounds, read_scene, write_scene
 
 # Without bounds, the trajectory fills this share of the part of space that is not contracted.
 _TRAJECTORY_SHARE = 0.25
 _STAND_IN_VIEWS = 8
 _ASIDE_PX = 1e-3
+# The data manager's, which is read first; the folder's parts may be on lines of their own.
+_DATA = re.compile(r"^    data:.*\n((?:    - .*\n)*)", re.MULTILINE)
 
 
 class Normalization(NamedTuple):
@@ -56,6 +62,8 @@ class EbarfDataParserConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: EbarfDataParser)
     data: Path = Path("scene")
     """The scene folder."""
+    kept: tyro.conf.Suppress[Path | None] = None
+    """What a trained run has of its scene: it is opened by that where the scene is gone. Training fills it in."""
 
 
 @dataclass
@@ -67,8 +75,9 @@ class EbarfDataParser(DataParser):
     def __init__(self, config: EbarfDataParserConfig):
         super().__init__(config)
         with one_line_errors():
-            self.scene = read_scene(Path(config.data))
+            self.scene = read_scene(_scene_folder(config))
             self.trajectory = read_tum(self.scene.trajectory)
+            _check_scene_is_the_runs(self.scene, self.trajectory, config.kept)
             self.normalization = _normalization(self.scene, self.trajectory)
             self.mount_scale = self.normalization.scale / _reference_units(self.scene, self.trajectory)
 
@@ -105,6 +114,53 @@ class EbarfDataParser(DataParser):
             return self._keyframe_views(keyframes, max(1, len(keyframes.t_us) // _STAND_IN_VIEWS))
         event_camera = Trajectory(times[inside], interpolate(keyframes.t_us, keyframes.poses, times[inside]))
         return frame_cameras(frames, event_camera, self.mount_scale), [frame.path for frame in frames]
+
+
+def keep_scene(scene: Scene, folder: Path) -> None:
+    """Write what a trained run needs of its scene: all but recording and frames, which may be large."""
+    with whole_folder(folder) as kept:
+        copies = {}
+        for name in ("trajectory", "groundtruth"):
+            if path := getattr(scene, name):
+                copies[name] = kept / f"{name}.txt"
+                copies[name].write_bytes(path.read_bytes())
+        write_scene(replace(scene, folder=kept, frames=(), **copies))
+
+
+def moved(config: EbarfDataParserConfig) -> str:
+    """Where a scene is not, and how a trained run is told where it is."""
+    said = f"{Path(config.data).absolute()}: no such folder, expected the scene of the run; where it was moved, change"
+    path = config.kept.parent / "config.yml" if config.kept else None
+    found = _DATA.search(path.read_text(encoding="utf-8")) if path and path.is_file() else None
+    if path is None or found is None:
+        return f"{said} 'data:' under pipeline, datamanager in the run's config.yml to 'data: NEW PLACE'"
+    first = found.string.count("\n", 0, found.start()) + 1
+    lines = f"line {first}" if not found[1] else f"lines {first} to {first + found[1].count(chr(10))}"
+    return f"{said} {lines} of {path.absolute()} to '    data: NEW PLACE'"
+
+
+def _scene_folder(config: EbarfDataParserConfig) -> Path:
+    """The scene, or where it is gone what the run has kept of it."""
+    folder = Path(config.data)
+    if folder.is_dir():
+        return folder
+    if config.kept is None or not (config.kept / "scene.json").is_file():
+        raise SceneError(moved(config))
+    sys.stderr.write(f"opened by the run's own {config.kept}, without frames and recording ({moved(config)})\n")
+    return config.kept
+
+
+def _check_scene_is_the_runs(scene: Scene, trajectory: Trajectory, kept: Path | None) -> None:
+    """Another scene may have come to the place of the one that a run was trained on."""
+    if kept is None or not (kept / "trajectory.txt").is_file():
+        return
+    trained = read_tum(kept / "trajectory.txt")
+    columns = zip((trajectory.t_us, *trajectory.poses), (trained.t_us, *trained.poses), strict=True)
+    if not all(torch.equal(now, then) for now, then in columns):
+        raise SceneError(
+            f"{scene.trajectory.absolute()}: {len(trajectory.t_us)} keyframes, other than the {len(trained.t_us)} of "
+            f"{(kept / 'trajectory.txt').absolute()}, expected those that the run was trained on"
+        )
 
 
 def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:

@@ -5,9 +5,13 @@ from __future__ import annotations
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from ebarf_ns.errors import TrainingError
 
 if TYPE_CHECKING:
+    from nerfstudio.configs.base_config import MachineConfig
+
     from ebarf_ns.nerf.trainer import EbarfTrainerConfig
 
 _ABOVE_0 = ("max_num_iterations", "max_train_seconds")
@@ -66,4 +70,19 @@ def check_settings(config: EbarfTrainerConfig) -> None:
         raise TrainingError(
             f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
             "Eq. 6 has no unit for what silence allows"
+        )
+
+
+def check_machine(machine: MachineConfig) -> None:
+    """Raise :class:`TrainingError` for devices that are not here."""
+    found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    here = [device for device, there in found.items() if there]
+    if machine.device_type not in here:
+        raise TrainingError(
+            f"--machine.device-type is {machine.device_type}, expected one that is here: {', '.join(here)}"
+        )
+    most = torch.cuda.device_count() if machine.device_type == "cuda" else 1
+    if not 1 <= machine.num_devices <= most:
+        raise TrainingError(
+            f"--machine.num-devices is {machine.num_devices}, expected 1 to {most}, as many as are here"
         )

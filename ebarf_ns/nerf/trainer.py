@@ -6,7 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -30,11 +30,12 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.checkpoints import newest_whole, not_finite, read_checkpoint, write_checkpoint
+from ebarf_ns.nerf.dataparser import keep_scene, moved
 from ebarf_ns.nerf.metrics_file import begin_metrics, config_digest, read_header, record_metrics, scene_digest
 from ebarf_ns.nerf.optimizers import BudgetDecay, GuardedOptimizers
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.run_folder import take_folder
-from ebarf_ns.nerf.settings_check import check_settings
+from ebarf_ns.nerf.settings_check import check_machine, check_settings
 from ebarf_ns.nerf.support import Support, support
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
@@ -62,6 +63,12 @@ class EbarfTrainerConfig(TrainerConfig):
     camera_refined.json, as scene.json has it."""
     averaged_steps: int = 100
     """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
+
+    def save_config(self) -> None:
+        """Write config.yml, which is what ns-train begins with, unless this machine lacks what is asked of it."""
+        with one_line_errors():
+            check_machine(self.machine)
+        super().save_config()
 
 
 class EbarfTrainer(Trainer):
@@ -113,6 +120,8 @@ class EbarfTrainer(Trainer):
         """Fill in what the configuration leaves to the plan, and keep it with the run."""
         datamanager = self.config.pipeline.datamanager
         folder = datamanager.data or datamanager.dataparser.data  # pyright: ignore[reportAttributeAccessIssue]
+        if datamanager.dataparser.kept and not Path(folder).is_dir():  # pyright: ignore[reportAttributeAccessIssue]
+            raise TrainingError(moved(replace(datamanager.dataparser, data=Path(folder))))  # pyright: ignore[reportAttributeAccessIssue]
         scene = read_scene(Path(folder))
         trajectory = read_tum(scene.trajectory)
         check_bounds(scene, trajectory)
@@ -130,7 +139,7 @@ class EbarfTrainer(Trainer):
         normalized = model.loss == "normalized"
         lines = plan_for(scene, start, events, device, model.grid_coarsest, model.grid_finest, normalized, facts)
         self.plan = apply_plan(self._lines_of_resumed_run(lines), self.config)
-        self._keep_plan()
+        self._keep_plan(scene)
 
     def _align(self) -> None:
         """Look for large errors of the trajectory, where a run begins and its budget allows for it."""
@@ -173,7 +182,10 @@ class EbarfTrainer(Trainer):
             )
 
     @check_main_thread
-    def _keep_plan(self) -> None:
+    def _keep_plan(self, scene: Scene) -> None:
+        kept = self.base_dir / "scene"
+        keep_scene(scene, kept)
+        self.config.pipeline.datamanager.dataparser.kept = kept  # pyright: ignore[reportAttributeAccessIssue]
         with whole_file(self.base_dir / "config.yml") as temporary:
             temporary.write_text(yaml.dump(self.config), encoding="utf-8")
 
@@ -364,6 +376,7 @@ class EbarfTrainer(Trainer):
         configuration = {key: value for key, value in asdict(self.config).items() if key not in places}
         datamanager = configuration["pipeline"]["datamanager"]
         datamanager["data"] = datamanager["dataparser"]["data"] = None
+        del datamanager["dataparser"]["kept"]
         return {
             "versions": {name: version(name) for name in ("ebarf_ns", "nerfstudio", "torch", "numpy")},
             "method": self.config.method_name,

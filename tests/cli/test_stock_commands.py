@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -187,6 +188,51 @@ def test_a_run_outlives_its_recording(without_recording: Path, tmp_path: Path):
         "ns-export", "pointcloud", *run, "--output-dir", tmp_path / "cloud", "--normal-method=open3d"
     )
     assert finished.code == 2 and "no such file, expected the recording" in finished.errors
+
+
+@pytest.fixture
+def without_scene(trained_run: Path, tiny_scene: Path, tmp_path: Path) -> Iterator[Path]:
+    """The trained run, as long as its scene is elsewhere."""
+    shutil.move(tiny_scene, tmp_path / "elsewhere")
+    yield trained_run
+    shutil.move(tmp_path / "elsewhere", tiny_scene)
+
+
+@needs_ffmpeg
+def test_a_run_is_opened_without_its_scene_and_says_where_it_looked(
+    without_scene: Path, tiny_scene: Path, tmp_path: Path
+):
+    options = ["--camera-path-filename", camera_path(tmp_path), "--output-path", tmp_path / "out.mp4"]
+    finished = run_command("ns-render", "camera-path", *config(without_scene), *options)
+    assert finished.code == 0 and all(frame.std() > 5 for frame in frames_of(tmp_path / "out.mp4"))
+    said = " ".join(finished.errors.split())
+    assert f"{tiny_scene}: no such folder" in said
+    (line,) = re.findall(
+        rf"change line (\d+) of {without_scene / 'config.yml'} to '    data: NEW PLACE'", finished.errors
+    )
+    changed = (without_scene / "config.yml").read_text().splitlines()
+    changed[int(line) - 1] = f"    data: {tmp_path / 'elsewhere'}"
+    (tmp_path / "config.yml").write_text("\n".join(changed) + "\n")
+    run_ok("ns-eval", "--load-config", tmp_path / "config.yml", "--output-path", tmp_path / "eval.json")
+    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 5
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--machine.device-type=mps"], "--machine.device-type is mps, expected one that is here: "),
+        (["--machine.num-devices=99"], "--machine.num-devices is 99, expected 1 to "),
+    ],
+)
+@pytest.mark.skipif(torch.backends.mps.is_available(), reason="has what must be missing")
+def test_a_device_that_is_not_here_is_said_before_anything_is_written(
+    tiny_scene: Path, tmp_path: Path, flags: list[str], words: str
+):
+    finished = run_command(
+        "ns-train", "ebarf", "--data", tiny_scene, "--output-dir", tmp_path / "runs", "--vis=tensorboard", *flags
+    )
+    assert finished.code == 2 and finished.errors.strip().splitlines()[-1].startswith(f"error: {words}")
+    assert "Traceback" not in finished.errors + finished.output and not list(tmp_path.iterdir())
 
 
 def test_viewer_serves_its_page(trained_run: Path):

@@ -14,6 +14,7 @@ from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from rosbags.highlevel import AnyReader
 
@@ -33,6 +34,18 @@ _ROS2_EVENT = np.dtype(
         "itemsize": 16,
     }
 )
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+# Bytes a channel, channels, and what makes grey of them; ROS and OpenCV name a Bayer pattern by different corners.
+_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 1, None), "8UC1": (1, 1, None), "mono16": (2, 1, None), "16UC1": (2, 1, None),
+    "bgr8": (1, 3, cv2.COLOR_BGR2GRAY), "8UC3": (1, 3, cv2.COLOR_BGR2GRAY), "rgb8": (1, 3, cv2.COLOR_RGB2GRAY),
+    "bgra8": (1, 4, cv2.COLOR_BGRA2GRAY), "8UC4": (1, 4, cv2.COLOR_BGRA2GRAY), "rgba8": (1, 4, cv2.COLOR_RGBA2GRAY),
+    "bgr16": (2, 3, cv2.COLOR_BGR2GRAY), "rgb16": (2, 3, cv2.COLOR_RGB2GRAY),
+    "bayer_rggb8": (1, 1, cv2.COLOR_BayerBG2GRAY), "bayer_bggr8": (1, 1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGR2GRAY), "bayer_grbg8": (1, 1, cv2.COLOR_BayerGB2GRAY),
+    "bayer_rggb16": (2, 1, cv2.COLOR_BayerBG2GRAY), "bayer_bggr16": (2, 1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg16": (2, 1, cv2.COLOR_BayerGR2GRAY), "bayer_grbg16": (2, 1, cv2.COLOR_BayerGB2GRAY),
+}  # fmt: skip
 _MONO_EVENT = np.dtype([("t_ns", "<u4"), ("x", "<u2"), ("y_p", "<u2")])
 
 
@@ -160,20 +173,90 @@ def _mono(packet: Any, place: Callable[[int], str]) -> Piece:
     return Piece(events["x"], events["y_p"] & 0x7FFF, t_us, (events["y_p"] >> 15).astype(np.int8), place)
 
 
-def read_bag_frames(path: Path, size: tuple[int, int], topic: str | None = None) -> Iterator[tuple[int, np.ndarray]]:
-    """8-bit grey images as large as the event sensor, with their times in microseconds: those of the topic whose name
-    is most like that of the events' (of two sensors in a bag, either has its own)."""
+def read_bag_frames(
+    path: Path, size: tuple[int, int], topic: str | None, left_out: Counter[str]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Grey images of 8 or 16 bits, as large as the event sensor, with their times in microseconds; the rest is counted.
+
+    They are those of the topic whose name is most like that of the events' (of two sensors in a bag, either has its
+    own); of several, rather as the sensor took them than rectified, grey than colour, whole than compressed.
+    """
     with _opened(path) as bag:
         events = _of_events(path, bag, topic)[0].topic
-        images = [one for one in bag.connections if one.msgtype == "sensor_msgs/msg/Image"]
-        for name in sorted({one.topic for one in images}, key=lambda name: (-len(commonprefix([name, events])), name)):
-            found = False
-            for connection, _, raw in bag.messages([one for one in images if one.topic == name]):
-                image: Any = bag.deserialize(raw, connection.msgtype)
-                if (image.width, image.height) != size or image.encoding not in ("mono8", "8UC1"):
-                    break
-                found = True
-                grey = np.asarray(image.data, np.uint8).reshape(image.height, image.step)[:, : image.width]
-                yield image.header.stamp.sec * 10**6 + (image.header.stamp.nanosec + 500) // 1000, grey
-            if found:
-                return
+        images = {one.topic: [] for one in bag.connections if one.msgtype in (_IMAGE, _COMPRESSED)}
+        for one in bag.connections:
+            if one.topic in images:
+                images[one.topic].append(one)
+        looked_at = {name: _first(bag, connections, size) for name, connections in images.items()}
+        chosen = min(images, key=lambda name: _rank(name, events, looked_at[name], images[name][0].msgtype), default="")
+        for name, connections in images.items():
+            if name != chosen and (count := sum(one.msgcount for one in connections)):
+                problem = looked_at[name] if isinstance(looked_at[name], str) else f"those of {chosen} are taken"
+                left_out[f"{name}: {problem}"] += count
+        connections = images.get(chosen, [])
+        shift = _empty_bits(bag, connections, size, looked_at.get(chosen))
+        for connection, _, raw in bag.messages(connections) if connections else ():
+            found = _picture(bag, raw, connection, size)
+            if isinstance(found, str):
+                left_out[f"{chosen}: {found}"] += 1
+            else:
+                yield found[0], found[1] << shift if found[1].dtype == np.uint16 else found[1]
+
+
+_Found = tuple[int, np.ndarray] | str
+"""Time and grey values, or what is wrong with a message."""
+
+
+def _rank(name: str, events: str, found: _Found | None, kind: str) -> tuple[Any, ...]:
+    wrong, rectified = not isinstance(found, tuple), "rect" in name.rsplit("/", 1)[-1]
+    return wrong, -len(commonprefix([name, events])), rectified, "colo" in name, kind == _COMPRESSED, name
+
+
+def _first(bag: AnyReader, connections: list[Any], size: tuple[int, int]) -> _Found | None:
+    return next((_picture(bag, raw, one, size) for one, _, raw in bag.messages(connections)), None)
+
+
+def _empty_bits(bag: AnyReader, connections: list[Any], size: tuple[int, int], first: _Found | None) -> int:
+    """How many of 16 bits no picture uses: sensors of 10 or 12 bits write theirs so too, nearly black."""
+    if not isinstance(first, tuple) or first[1].dtype != np.uint16:
+        return 0
+    found = (_picture(bag, raw, one, size) for one, _, raw in bag.messages(connections))
+    brightest = max(int(one[1].max()) for one in found if isinstance(one, tuple) and one[1].dtype == np.uint16)
+    return 16 - max(brightest.bit_length(), 8)
+
+
+def _picture(bag: AnyReader, raw: bytes, connection: Any, size: tuple[int, int]) -> _Found:
+    try:
+        image: Any = bag.deserialize(raw, connection.msgtype)
+        stamp = image.header.stamp
+        grey = _decompressed(image) if connection.msgtype == _COMPRESSED else _grey(image)
+    except Exception:
+        # The library promises no kind of exception; a picture that is spoilt is no reason to refuse the events.
+        return f"cannot be taken apart, expected {connection.msgtype}"
+    if isinstance(grey, np.ndarray) and grey.shape != size[::-1]:
+        grey = f"{grey.shape[1]} x {grey.shape[0]} pixels, expected the event sensor's {size[0]} x {size[1]}"
+    return grey if isinstance(grey, str) else (stamp.sec * 10**6 + (stamp.nanosec + 500) // 1000, grey)
+
+
+def _grey(image: Any) -> np.ndarray | str:
+    if image.encoding not in _ENCODINGS:
+        return f"encoded as {image.encoding!r:.40}, expected one of {', '.join(_ENCODINGS)}"
+    depth, channels, conversion = _ENCODINGS[image.encoding]
+    width, height, length, used = image.width, image.height, len(image.data), image.width * channels * depth
+    # A row may be padded, but not by whole pictures: that is colour under a wrong name.
+    if not (width and height and used <= image.step < 2 * used and length == image.step * height):
+        return (
+            f"{image.encoding} of {width} x {height} pixels in {length:,} bytes with rows of {image.step:,}, expected "
+            f"{used * height:,} with rows of {used:,}"
+        )
+    rows = np.asarray(image.data, np.uint8).reshape(height, image.step)[:, :used]
+    order = ">" if image.is_bigendian else "<"
+    pixels = np.ascontiguousarray(rows).view(f"{order}u{depth}").astype(f"u{depth}")
+    return pixels if conversion is None else cv2.cvtColor(pixels.reshape(height, width, -1), conversion)
+
+
+def _decompressed(image: Any) -> np.ndarray | str:
+    pixels = cv2.imdecode(np.frombuffer(bytes(image.data), np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        return f"compressed as {image.format!r:.40}, which cannot be read as a picture"
+    return pixels
