@@ -17,7 +17,7 @@ import torch
 
 from ebarf_ns.calibration import read_calibration
 from ebarf_ns.errors import SceneError, TrajectoryError
-from ebarf_ns.evaluation.compare import read_by_reference
+from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.events.intake import Intake, hot_pixels, take_in
 from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised
 from ebarf_ns.events.source import Source, TimeUnit
@@ -26,7 +26,7 @@ from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import write_tum
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, order_is_known, read_trajectory
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
@@ -158,20 +158,20 @@ def _assemble(
     hot = hot_pixels(source, size, intake, intake.hot_pixels) if intake.hot_pixels is not None else None
     source = ingredients.open_events() if hot is not None else source
     report = take_in(source, size, intake, folder / "events.h5", hot, progress)
+    span_us = report.first_us, report.last_us
     groundtruth = ingredients.groundtruth
     if settings.groundtruth:
         known = settings.trajectory_format
         # What the flags say is of the other file then, but for the times, which are of those that have none.
         known = TrajectoryFormat(pose_times=known.pose_times) if settings.trajectory else known
-        groundtruth, said = read_trajectory(settings.groundtruth, known)
+        groundtruth, said = read_trajectory(settings.groundtruth, known, span_us)
         notes += said
     initial = groundtruth
     if settings.trajectory:
-        initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth)
+        initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth, span_us)
         notes += said
     if initial is None:
         raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
-    span_us = report.first_us, report.last_us
     initial = _clipped(initial, span_us, settings.trajectory or source.path)
     write_tum(folder / "trajectory.txt", initial)
     if groundtruth is not None:
@@ -213,11 +213,13 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
     return camera
 
 
-def _initial(path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None) -> tuple[Trajectory, list[str]]:
+def _initial(
+    path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None, span_us: tuple[int, int]
+) -> tuple[Trajectory, list[str]]:
     """As the file says; the order of quaternions that it does not say, the reference tells where there is one."""
-    if groundtruth is None or order_is_known(path, known):
-        return read_trajectory(path, known)
-    return read_by_reference(path, groundtruth, known)
+    if groundtruth is None:
+        return read_trajectory(path, known, span_us)
+    return read_beside_reference(path, groundtruth, known, span_us)
 
 
 def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:

@@ -9,6 +9,7 @@ from ebarf_ns.errors import EvaluationError, TrajectoryError
 from ebarf_ns.evaluation.trajectory_error import (
     ALIGNMENTS,
     errors_under_each_alignment,
+    rotation_error_deg,
     rotation_errors_by_positions_deg,
 )
 from ebarf_ns.geometry.trajectory import Trajectory
@@ -16,10 +17,13 @@ from ebarf_ns.geometry.trajectory_formats import (
     NOTHING_KNOWN,
     Axes,
     Quaternion,
+    RawPoses,
     TrajectoryFormat,
     Transform,
-    order_is_known,
+    order_is_doubtful,
+    read_raw,
     read_trajectory,
+    trajectory_of,
 )
 
 # The right convention is better than all others by this factor, or the motion cannot tell.
@@ -34,11 +38,7 @@ def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOT
     :class:`EvaluationError` where no alignment is defined.
     """
     true, notes = read_trajectory(reference)
-    if order_is_known(estimate, known):
-        estimated, said = read_trajectory(estimate, known)
-        said += _note_on_axes(estimate, true, known)
-    else:
-        estimated, said = read_by_reference(estimate, true, known)
+    estimated, said = read_beside_reference(estimate, true, known)
     errors, reasons = errors_under_each_alignment(estimated, true)
     if not errors:
         raise EvaluationError(f"{estimate}: {next(iter(reasons.values()))}")
@@ -50,6 +50,48 @@ def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOT
     return {**comparison, "scale": errors["sim3"].scale if "sim3" in errors else None, "notes": notes}
 
 
+def read_beside_reference(
+    path: Path,
+    reference: Trajectory,
+    known: TrajectoryFormat = NOTHING_KNOWN,
+    span_us: tuple[int, int] | None = None,
+) -> tuple[Trajectory, list[str]]:
+    """A trajectory as it says itself, and where it does not say the order of its quaternions, as the reference does.
+
+    The usual order stays unless another one fits clearly better. ``span_us`` is that of the events; of the reference
+    where not given.
+    """
+    raw, span_us = read_raw(path, known), span_us or _span_us(reference)
+    if order_is_doubtful(path, raw, known, span_us):
+        return _read_by_reference(path, raw, reference, known, span_us)
+    trajectory, notes = trajectory_of(path, raw, known, span_us)
+    usual = replace(
+        known, quaternion=known.quaternion or raw.quaternion or "xyzw", transform=known.transform or raw.transform
+    )
+    if raw.order_told or known.quaternion:
+        return trajectory, notes + _note_on_axes(path, raw, reference, known)
+    try:
+        tried = _tried(path, raw, reference, known, span_us)
+    except TrajectoryError:
+        return trajectory, notes + _note_on_order(path, raw, reference, usual, span_us)
+    (best_deg, best), (second_deg, _) = tried[:2]
+    usual_deg = next(
+        deg for deg, one in tried if (one.quaternion, one.transform) == (usual.quaternion, usual.transform)
+    )
+    if (best.quaternion, best.transform) == (usual.quaternion, usual.transform) or best_deg > _CLEARLY * second_deg:
+        return trajectory, notes + _note_on_axes(path, raw, reference, known)
+    if best.transform != usual.transform:
+        flags = f"--quaternion {best.quaternion} --transform {best.transform}"
+        return trajectory, [*notes, f"{path.name}: {usual_deg:.2g} deg off the reference; as {best.quaternion}, "
+                            f"{best.transform} it would fit to {best_deg:.2g} deg: {flags}?"]  # fmt: skip
+    trajectory, notes = trajectory_of(path, raw, best, span_us)
+    notes.append(
+        f"{path.name}: quaternions as {best.quaternion}, which fits the reference to {best_deg:.2g} deg, as "
+        f"{usual.quaternion} to {usual_deg:.2g} deg; --quaternion says otherwise"
+    )
+    return trajectory, notes + _note_on_axes(path, raw, reference, best)
+
+
 def read_by_reference(
     path: Path, reference: Trajectory, known: TrajectoryFormat = NOTHING_KNOWN
 ) -> tuple[Trajectory, list[str]]:
@@ -59,13 +101,13 @@ def read_by_reference(
     rotation between the two bodies; then the axes, without. Raises :class:`TrajectoryError` where several orders fit
     alike: then the motion cannot tell, and has to be told.
     """
-    quaternions = (known.quaternion,) if known.quaternion else get_args(Quaternion)
-    transforms = (known.transform,) if known.transform else get_args(Transform)
-    tried: list[tuple[float, TrajectoryFormat]] = []
-    for quaternion, transform in product(quaternions, transforms):
-        attempt = replace(known, quaternion=quaternion, transform=transform)
-        tried.append((_off_deg(path, reference, attempt, body=True), attempt))
-    tried.sort(key=lambda one: one[0])
+    return _read_by_reference(path, read_raw(path, known), reference, known, _span_us(reference))
+
+
+def _read_by_reference(
+    path: Path, raw: RawPoses, reference: Trajectory, known: TrajectoryFormat, span_us: tuple[int, int]
+) -> tuple[Trajectory, list[str]]:
+    tried = _tried(path, raw, reference, known, span_us)
     best_deg, best = tried[0]
     if len(tried) > 1 and (best_deg > _CLEARLY * tried[1][0] or tried[1][0] < _STILL_DEG):
         second = tried[1][1]
@@ -74,17 +116,53 @@ def read_by_reference(
             f"{tried[1][0]:.2g} deg as {second.quaternion} {second.transform}; expected --quaternion and --transform, "
             "which this motion cannot tell"
         )
-    trajectory, notes = read_trajectory(path, best)
+    trajectory, notes = trajectory_of(path, raw, best, span_us)
     notes.append(f"{path.name}: {best.quaternion}, {best.transform} fits the reference to {best_deg:.2g} deg")
-    return trajectory, notes + _note_on_axes(path, reference, best)
+    return trajectory, notes + _note_on_axes(path, raw, reference, best)
 
 
-def _note_on_axes(path: Path, reference: Trajectory, found: TrajectoryFormat) -> list[str]:
+def _span_us(trajectory: Trajectory) -> tuple[int, int]:
+    return int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+
+
+def _tried(
+    path: Path, raw: RawPoses, reference: Trajectory, known: TrajectoryFormat, span_us: tuple[int, int]
+) -> list[tuple[float, TrajectoryFormat]]:
+    """How far off every order and transform that is left open is, the best first."""
+    quaternions = (known.quaternion,) if known.quaternion else get_args(Quaternion)
+    transforms = (known.transform,) if known.transform else get_args(Transform)
+    tried: list[tuple[float, TrajectoryFormat]] = []
+    for quaternion, transform in product(quaternions, transforms):
+        attempt = replace(known, quaternion=quaternion, transform=transform)
+        tried.append((_off_deg(path, raw, reference, attempt, body=True), attempt))
+    return sorted(tried, key=lambda one: one[0])
+
+
+def _note_on_order(
+    path: Path, raw: RawPoses, reference: Trajectory, usual: TrajectoryFormat, span_us: tuple[int, int]
+) -> list[str]:
+    """By rotations alone, which tell where the two bodies are one, and positions cannot."""
+    tried = []
+    try:
+        for quaternion in get_args(Quaternion):
+            estimate, _ = trajectory_of(path, raw, replace(usual, quaternion=quaternion), span_us)
+            tried.append((rotation_error_deg(estimate, reference), quaternion))
+    except (TrajectoryError, EvaluationError):
+        return []
+    (best_deg, best), (second_deg, _) = sorted(tried)[:2]
+    if best == usual.quaternion or best_deg > _CLEARLY * second_deg or second_deg < _STILL_DEG:
+        return []
+    return [f"{path.name}: as {best} it would fit the reference to {best_deg:.2g} deg: --quaternion {best}?"]
+
+
+def _note_on_axes(path: Path, raw: RawPoses, reference: Trajectory, found: TrajectoryFormat) -> list[str]:
     """Only where the two bodies are one do axes show; then those given should fit best."""
     if found.axes:
         return []
     try:
-        tried = sorted((_off_deg(path, reference, replace(found, axes=one), body=False), one) for one in get_args(Axes))
+        tried = sorted(
+            (_off_deg(path, raw, reference, replace(found, axes=one), body=False), one) for one in get_args(Axes)
+        )
     except TrajectoryError:
         return []
     (best_deg, axes), (second_deg, _) = tried[:2]
@@ -94,8 +172,8 @@ def _note_on_axes(path: Path, reference: Trajectory, found: TrajectoryFormat) ->
     return [f"{path.name}: with {axes} axes it would fit the reference to {best_deg:.2g} deg: --axes {axes}?"]
 
 
-def _off_deg(path: Path, reference: Trajectory, attempt: TrajectoryFormat, body: bool) -> float:
-    estimate, _ = read_trajectory(path, attempt)
+def _off_deg(path: Path, raw: RawPoses, reference: Trajectory, attempt: TrajectoryFormat, body: bool) -> float:
+    estimate, _ = trajectory_of(path, raw, attempt, _span_us(reference))
     try:
         same_body_deg, other_body_deg = rotation_errors_by_positions_deg(estimate, reference)
     except EvaluationError as error:
