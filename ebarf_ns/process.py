@@ -24,12 +24,15 @@ from ebarf_ns.events.source import Source, TimeUnit
 from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
-from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
 from ebarf_ns.geometry.trajectory_file import write_tum
 from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
+from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
+# A trajectory this much longer than its recording, with no two poses among the events, is in another unit of time.
+_LONGEST_SPAN_RATIO = 100
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 Format = Literal[
     "auto", "ecd", "tumvie", "eds", "esim", "robust-e-nerf", "hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "text"
@@ -172,7 +175,10 @@ def _assemble(
         notes += said
     if initial is None:
         raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
+    windowed = intake.start_us is not None or intake.end_us is not None
+    notes += _apart(initial, span_us, settings.trajectory or source.path, windowed)
     initial = _clipped(initial, span_us, settings.trajectory or source.path)
+    notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
     write_tum(folder / "trajectory.txt", initial)
     if groundtruth is not None:
         groundtruth = _clipped(groundtruth, span_us, settings.groundtruth or source.path)
@@ -233,6 +239,19 @@ def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Tr
             f"{span_us[1]} us; expected at least 2 poses around the events, on the same clock"
         )
     return clipped
+
+
+def _apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, windowed: bool) -> list[str]:
+    """What is odd where all events lie between two poses; raises :class:`TrajectoryError` where nothing explains it."""
+    t_us, events_s = trajectory.t_us, (span_us[1] - span_us[0]) * 1e-6
+    among = int(within_span(t_us, torch.tensor(span_us)).sum())
+    poses_s = float(t_us[-1] - t_us[0]) * 1e-6
+    if among >= 2 or not bool(within_span(torch.tensor(span_us), t_us).any()):
+        return []
+    said = f"{path}: the {len(t_us)} poses span {poses_s:g} s, with {among} of them among the events, which span "
+    if poses_s > _LONGEST_SPAN_RATIO * events_s and not windowed:
+        raise TrajectoryError(f"{said}{events_s:g} s; expected one unit of time: --event-time-unit or --pose-time-unit")
+    return [f"{said}{events_s:g} s: times in another unit? (--event-time-unit, --pose-time-unit)"]
 
 
 def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -74,16 +74,17 @@ def read_beside_reference(
         tried = _tried(path, raw, reference, known, span_us)
     except TrajectoryError:
         return trajectory, notes + _note_on_order(path, raw, reference, usual, span_us)
-    (best_deg, best), (second_deg, _) = tried[:2]
-    usual_deg = next(
-        deg for deg, one in tried if (one.quaternion, one.transform) == (usual.quaternion, usual.transform)
-    )
-    if (best.quaternion, best.transform) == (usual.quaternion, usual.transform) or best_deg > _CLEARLY * second_deg:
+    alike = [one for one in tried if one[1].transform == usual.transform]
+    (best_deg, best), usual_deg = tried[0], next(deg for deg, one in alike if one.quaternion == usual.quaternion)
+    if best_deg > _CLEARLY * usual_deg or usual_deg < _STILL_DEG:
         return trajectory, notes + _note_on_axes(path, raw, reference, known)
-    if best.transform != usual.transform:
+    if best != alike[0][1] or best_deg > _CLEARLY * alike[1][0]:
         flags = f"--quaternion {best.quaternion} --transform {best.transform}"
-        return trajectory, [*notes, f"{path.name}: {usual_deg:.2g} deg off the reference; as {best.quaternion}, "
-                            f"{best.transform} it would fit to {best_deg:.2g} deg: {flags}?"]  # fmt: skip
+        notes.append(
+            f"{path.name}: as {usual.quaternion}, {usual.transform} it is {usual_deg:.2g} deg off the reference, as "
+            f"{best.quaternion}, {best.transform} it would be {best_deg:.2g} deg: {flags}?"
+        )
+        return trajectory, notes
     trajectory, notes = trajectory_of(path, raw, best, span_us)
     notes.append(
         f"{path.name}: quaternions as {best.quaternion}, which fits the reference to {best_deg:.2g} deg, as "

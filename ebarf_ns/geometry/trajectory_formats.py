@@ -99,9 +99,9 @@ def trajectory_of(
     earlier = torch.nonzero(t_us.diff() < 0).flatten().tolist()
     if earlier:
         place = raw.place(path, earlier[0] + 1).removeprefix(f"{path.parent}/")
+        others = f", as {len(earlier) - 1} others," if len(earlier) > 1 else ""
         notes.append(
-            f"{place} is the first of {len(earlier)} pose{'' if len(earlier) == 1 else 's'} earlier than the one "
-            "before; poses were not in order of time, and are sorted"
+            f"{place}{others} is earlier than the pose before; poses were not in order of time, and are sorted"
         )
     return trajectory, [*notes, *raw.notes]
 
