@@ -12,7 +12,7 @@ from ebarf_ns.evaluation.trajectory_error import (
     rotation_error_deg,
     rotation_errors_by_positions_deg,
 )
-from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_formats import (
     NOTHING_KNOWN,
     Axes,
@@ -29,6 +29,10 @@ from ebarf_ns.geometry.trajectory_formats import (
 # The right convention is better than all others by this factor, or the motion cannot tell.
 _CLEARLY = 0.5
 _STILL_DEG = 0.01
+# No order of quaternions is doubted that fits to this.
+_GOOD_DEG = 2.0
+# Poses that are tried, of very many evenly.
+_MOST = 2000
 
 
 def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> dict[str, Any]:
@@ -37,7 +41,7 @@ def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOT
     The files are of any format that :func:`read_trajectory` knows; ``known`` is of the estimate. Raises
     :class:`EvaluationError` where no alignment is defined.
     """
-    true, notes = read_trajectory(reference)
+    true, notes = _reference(reference, estimate, known)
     estimated, said = read_beside_reference(estimate, true, known)
     errors, reasons = errors_under_each_alignment(estimated, true)
     if not errors:
@@ -48,6 +52,19 @@ def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOT
         comparison["matched"] = comparison[alignment].pop("matched")
     notes = said + notes + [f"{alignment}: {reason}" for alignment, reason in reasons.items()]
     return {**comparison, "scale": errors["sim3"].scale if "sim3" in errors else None, "notes": notes}
+
+
+def _reference(path: Path, estimate: Path, known: TrajectoryFormat) -> tuple[Trajectory, list[str]]:
+    """Where it does not tell the unit of its times, the span of the estimate may."""
+    try:
+        return read_trajectory(path)
+    except TrajectoryError as problem:
+        try:
+            # Any order of quaternions will do for times.
+            span_us = _span_us(read_trajectory(estimate, replace(known, quaternion=known.quaternion or "xyzw"))[0])
+        except TrajectoryError:
+            raise problem from None
+        return read_trajectory(path, span_us=span_us)
 
 
 def read_beside_reference(
@@ -69,15 +86,15 @@ def read_beside_reference(
         known, quaternion=known.quaternion or raw.quaternion or "xyzw", transform=known.transform or raw.transform
     )
     if raw.order_told or known.quaternion:
-        return trajectory, notes + _note_on_axes(path, raw, reference, known)
+        return trajectory, notes + _note_on_axes(path, raw, reference, known, span_us)
     try:
         tried = _tried(path, raw, reference, known, span_us)
     except TrajectoryError:
         return trajectory, notes + _note_on_order(path, raw, reference, usual, span_us)
     alike = [one for one in tried if one[1].transform == usual.transform]
     (best_deg, best), usual_deg = tried[0], next(deg for deg, one in alike if one.quaternion == usual.quaternion)
-    if best_deg > _CLEARLY * usual_deg or usual_deg < _STILL_DEG:
-        return trajectory, notes + _note_on_axes(path, raw, reference, known)
+    if best_deg > _CLEARLY * usual_deg or usual_deg < _GOOD_DEG:
+        return trajectory, notes + _note_on_axes(path, raw, reference, known, span_us)
     if best != alike[0][1] or best_deg > _CLEARLY * alike[1][0]:
         flags = f"--quaternion {best.quaternion} --transform {best.transform}"
         notes.append(
@@ -90,7 +107,7 @@ def read_beside_reference(
         f"{path.name}: quaternions as {best.quaternion}, which fits the reference to {best_deg:.2g} deg, as "
         f"{usual.quaternion} to {usual_deg:.2g} deg; --quaternion says otherwise"
     )
-    return trajectory, notes + _note_on_axes(path, raw, reference, best)
+    return trajectory, notes + _note_on_axes(path, raw, reference, best, span_us)
 
 
 def read_by_reference(
@@ -119,7 +136,7 @@ def _read_by_reference(
         )
     trajectory, notes = trajectory_of(path, raw, best, span_us)
     notes.append(f"{path.name}: {best.quaternion}, {best.transform} fits the reference to {best_deg:.2g} deg")
-    return trajectory, notes + _note_on_axes(path, raw, reference, best)
+    return trajectory, notes + _note_on_axes(path, raw, reference, best, span_us)
 
 
 def _span_us(trajectory: Trajectory) -> tuple[int, int]:
@@ -135,7 +152,7 @@ def _tried(
     tried: list[tuple[float, TrajectoryFormat]] = []
     for quaternion, transform in product(quaternions, transforms):
         attempt = replace(known, quaternion=quaternion, transform=transform)
-        tried.append((_off_deg(path, raw, reference, attempt, body=True), attempt))
+        tried.append((_off_deg(path, raw, reference, attempt, span_us, body=True), attempt))
     return sorted(tried, key=lambda one: one[0])
 
 
@@ -156,13 +173,16 @@ def _note_on_order(
     return [f"{path.name}: as {best} it would fit the reference to {best_deg:.2g} deg: --quaternion {best}?"]
 
 
-def _note_on_axes(path: Path, raw: RawPoses, reference: Trajectory, found: TrajectoryFormat) -> list[str]:
+def _note_on_axes(
+    path: Path, raw: RawPoses, reference: Trajectory, found: TrajectoryFormat, span_us: tuple[int, int]
+) -> list[str]:
     """Only where the two bodies are one do axes show; then those given should fit best."""
     if found.axes:
         return []
     try:
         tried = sorted(
-            (_off_deg(path, raw, reference, replace(found, axes=one), body=False), one) for one in get_args(Axes)
+            (_off_deg(path, raw, reference, replace(found, axes=one), span_us, body=False), one)
+            for one in get_args(Axes)
         )
     except TrajectoryError:
         return []
@@ -173,8 +193,17 @@ def _note_on_axes(path: Path, raw: RawPoses, reference: Trajectory, found: Traje
     return [f"{path.name}: with {axes} axes it would fit the reference to {best_deg:.2g} deg: --axes {axes}?"]
 
 
-def _off_deg(path: Path, raw: RawPoses, reference: Trajectory, attempt: TrajectoryFormat, body: bool) -> float:
-    estimate, _ = trajectory_of(path, raw, attempt, _span_us(reference))
+def _off_deg(
+    path: Path,
+    raw: RawPoses,
+    reference: Trajectory,
+    attempt: TrajectoryFormat,
+    span_us: tuple[int, int],
+    body: bool,
+) -> float:
+    estimate, _ = trajectory_of(path, raw, attempt, span_us)
+    every = -(-len(estimate.t_us) // _MOST)
+    estimate = Trajectory(estimate.t_us[::every], Poses(*(column[::every] for column in estimate.poses)))
     try:
         same_body_deg, other_body_deg = rotation_errors_by_positions_deg(estimate, reference)
     except EvaluationError as error:

@@ -94,7 +94,8 @@ def rotations(
 ) -> Float[np.ndarray, "poses 3 3"]:
     """The matrices; raises :class:`TrajectoryError` where one is no rotation."""
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = ~(off <= 10 * _UNIT_LENGTH) | (np.linalg.det(matrices) < 0)
+    wrong = ~(off <= 10 * _UNIT_LENGTH)
+    wrong[~wrong] = np.linalg.det(matrices[~wrong]) < 0
     if wrong.any():
         k = int(wrong.argmax())
         place = f"{places[k]}: the matrix" if places else f"{path}: the matrix of pose {k}"
@@ -112,7 +113,9 @@ def moving(
             k = int(wrong.argmax())
             place = f"{places[k]}: the last row" if places else f"{path}: the last row of matrix {k}"
             row = " ".join(f"{value:g}" for value in matrices[k, 3])
-            raise TrajectoryError(f"{place} is {row}, expected 0 0 0 1 of a 4x4 matrix that moves points")
+            raise TrajectoryError(
+                f"{place} is {row}, expected 0 0 0 1 of a 4x4 matrix{', or a line of names above' if places else ''}"
+            )
     return matrices[:, :3, 3], rotations(path, matrices[:, :3, :3], places)
 
 

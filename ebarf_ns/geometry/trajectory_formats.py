@@ -120,10 +120,12 @@ def _check_numbers(path: Path, raw: RawPoses) -> None:
     """Raise :class:`TrajectoryError` unless there are two poses or more of finite numbers, each at its own time."""
     if len(raw.times) < 2:
         raise TrajectoryError(f"{path}: holds {len(raw.times)} pose{'s'[: not raw.times]}, expected 2 or more")
+    values = np.concatenate([raw.position, raw.rotation.reshape(len(raw.times), -1)], axis=1)
+    finite = np.isfinite(values).all(axis=1) & [time.is_finite() for time in raw.times]
+    if not finite.all():
+        raise TrajectoryError(f"{raw.place(path, int(finite.argmin()))}: a number is not finite, expected a pose")
     seen: dict[Decimal, int] = {}
     for k, time in enumerate(raw.times):
-        if not time.is_finite() or not np.isfinite(raw.position[k]).all() or not np.isfinite(raw.rotation[k]).all():
-            raise TrajectoryError(f"{raw.place(path, k)}: a number is not finite, expected a time and a pose")
         if (first := seen.setdefault(time, k)) != k:
             where = "" if first == k - 1 else f", as in {raw.place(path, first).removeprefix(f'{path}:').strip()}"
             where = where.replace("as in ", "as in line ") if raw.places else where

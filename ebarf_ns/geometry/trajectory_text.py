@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -74,18 +75,23 @@ def _table(path: Path, lines: list[str]) -> _Table:
     header: list[str] = []
     named = False
     for line_number, line in enumerate(lines, start=1):
-        fields = _fields(line.split("#")[0])
+        comment = line.lstrip().startswith(("%", "//"))
+        fields = [] if comment else _fields(line.split("#")[0])
         if not fields:
-            header += [] if rows else [line.strip().lstrip("#%").strip()]
+            header += [] if rows else [line.strip().lstrip("#%/").strip()]
         elif not rows and not named and not any(map(_begun, fields)):
-            header, named = [*header, line.strip().lstrip("%").strip()], True
+            header, named = [*header, line.strip()], True
         else:
-            if rows and len(fields) != len(rows[0]):
-                raise TrajectoryError(f"{path}:{line_number}: {len(fields)} columns, expected {len(rows[0])} as before")
             rows.append(fields)
             numbers.append(line_number)
     if not rows:
         raise TrajectoryError(f"{path}: holds no poses")
+    counts = [len(fields) for fields in rows]
+    usual = Counter(counts).most_common(1)[0][0]
+    for line_number, count in zip(numbers, counts, strict=True):
+        if count != usual:
+            where = "in the other lines" if line_number == numbers[0] else "before"
+            raise TrajectoryError(f"{path}:{line_number}: {count} columns, expected {usual} as {where}")
     return _Table(rows, numbers, header)
 
 
