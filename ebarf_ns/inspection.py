@@ -14,8 +14,9 @@ from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import Estimate, SensorFacts, identify_recording
 from ebarf_ns.geometry.smoothing import smoothed
-from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.plan import Line, plan_for
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
@@ -149,11 +150,31 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     gaps_us = trajectory.t_us.diff()
     if int(gaps_us.max()) > 5 * float(gaps_us.double().median()):
         found.append(f"the longest gap between keyframes is {int(gaps_us.max()) / 1000:.0f} ms, 5 times the median")
+    found.extend(_between_two(summary, trajectory))
+    found.extend(torn(trajectory))
     if scene.bounds is None:
         found.append(
             "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail"
         )
     return found
+
+
+def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
+    """All events between two keyframes: a camera that moves on a straight line, or another unit of time."""
+    if summary.start_us < summary.trajectory_start_us or summary.end_us > summary.trajectory_end_us:
+        return []
+    edges = torch.tensor([summary.start_us, summary.end_us], dtype=torch.int64)
+    left, _ = intervals(trajectory.t_us, edges)
+    among = int(within_span(trajectory.t_us, edges).sum())
+    if among >= 2:
+        return []
+    k = int(left[0])
+    gap_ms = float(trajectory.t_us[int(left[1]) + 1] - trajectory.t_us[k]) / 1000
+    events_ms = (summary.end_us - summary.start_us) / 1000
+    return [
+        f"all events, {events_ms:.3g} ms of them, lie between keyframes {k} and {int(left[1]) + 1}, {gap_ms:.3g} ms "
+        "apart: times in another unit? ebarf process has --event-time-unit and --pose-time-unit"
+    ]
 
 
 def print_summary(summary: Summary, folder: Path) -> None:

@@ -18,19 +18,22 @@ import torch
 
 from ebarf_ns.calibration import read_calibration
 from ebarf_ns.errors import SceneError, TrajectoryError
-from ebarf_ns.evaluation.compare import read_by_reference
+from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.events.intake import Intake, hot_pixels, take_in
 from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised
 from ebarf_ns.events.source import Source, TimeUnit
 from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
-from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
 from ebarf_ns.geometry.trajectory_file import write_tum
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, order_is_known, read_trajectory
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
+from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
+# A trajectory this much longer than its recording, with no two poses among the events, is in another unit of time.
+_LONGEST_SPAN_RATIO = 100
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 Format = Literal[
     "auto", "ecd", "tumvie", "eds", "esim", "robust-e-nerf", "hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "text"
@@ -167,21 +170,24 @@ def _assemble(
     hot = hot_pixels(source, size, intake, intake.hot_pixels) if intake.hot_pixels is not None else None
     source = ingredients.open_events() if hot is not None else source
     report = take_in(source, size, intake, folder / "events.h5", hot, progress)
+    span_us = report.first_us, report.last_us
     groundtruth = ingredients.groundtruth
     if settings.groundtruth:
         known = settings.trajectory_format
         # What the flags say is of the other file then, but for the times, which are of those that have none.
         known = TrajectoryFormat(pose_times=known.pose_times) if settings.trajectory else known
-        groundtruth, said = read_trajectory(settings.groundtruth, known)
+        groundtruth, said = read_trajectory(settings.groundtruth, known, span_us)
         notes += said
     initial = groundtruth
     if settings.trajectory:
-        initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth)
+        initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth, span_us)
         notes += said
     if initial is None:
         raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
-    span_us = report.first_us, report.last_us
+    windowed = intake.start_us is not None or intake.end_us is not None
+    notes += _apart(initial, span_us, settings.trajectory or source.path, windowed)
     initial = _clipped(initial, span_us, settings.trajectory or source.path)
+    notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
     write_tum(folder / "trajectory.txt", initial)
     if groundtruth is not None:
         groundtruth = _clipped(groundtruth, span_us, settings.groundtruth or source.path)
@@ -231,11 +237,13 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
     return camera
 
 
-def _initial(path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None) -> tuple[Trajectory, list[str]]:
+def _initial(
+    path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None, span_us: tuple[int, int]
+) -> tuple[Trajectory, list[str]]:
     """As the file says; the order of quaternions that it does not say, the reference tells where there is one."""
-    if groundtruth is None or order_is_known(path, known):
-        return read_trajectory(path, known)
-    return read_by_reference(path, groundtruth, known)
+    if groundtruth is None:
+        return read_trajectory(path, known, span_us)
+    return read_beside_reference(path, groundtruth, known, span_us)
 
 
 def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:
@@ -249,6 +257,19 @@ def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Tr
             f"{span_us[1]} us; expected at least 2 poses around the events, on the same clock"
         )
     return clipped
+
+
+def _apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, windowed: bool) -> list[str]:
+    """What is odd where all events lie between two poses; raises :class:`TrajectoryError` where nothing explains it."""
+    t_us, events_s = trajectory.t_us, (span_us[1] - span_us[0]) * 1e-6
+    among = int(within_span(t_us, torch.tensor(span_us)).sum())
+    poses_s = float(t_us[-1] - t_us[0]) * 1e-6
+    if among >= 2 or not bool(within_span(torch.tensor(span_us), t_us).any()):
+        return []
+    said = f"{path}: the {len(t_us)} poses span {poses_s:g} s, with {among} of them among the events, which span "
+    if poses_s > _LONGEST_SPAN_RATIO * events_s and not windowed:
+        raise TrajectoryError(f"{said}{events_s:g} s; expected one unit of time: --event-time-unit or --pose-time-unit")
+    return [f"{said}{events_s:g} s: times in another unit? (--event-time-unit, --pose-time-unit)"]
 
 
 def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -199,7 +199,7 @@ def _write_json(path: Path, content: object) -> None:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:

@@ -4,6 +4,7 @@ import json
 import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -283,6 +284,53 @@ def test_a_trajectory_on_another_clock_is_an_error(tmp_path: Path):
     settings = ProcessSettings(camera=calibration(tmp_path), trajectory=tmp_path / "late.txt")
     with pytest.raises(EbarfError, match="on the same clock"):
         process("esim", esim(tmp_path / "source"), tmp_path / "scene", settings)
+
+
+def odometry(tmp_path: Path, text: str, **settings: Any) -> tuple[list[str], list[str]]:
+    """What is said of the trajectory, and what is suspected of its scene."""
+    (tmp_path / "odometry.txt").write_text(text)
+    known = ProcessSettings(camera=calibration(tmp_path), trajectory=tmp_path / "odometry.txt", **settings)
+    source = tmp_path / "source"
+    if not source.exists():
+        esim(source)
+    said = process("esim", source, tmp_path / "scene", known)
+    return said, inspect_scene(tmp_path / "scene").suspicions
+
+
+def test_events_between_two_poses_are_in_another_unit(tmp_path: Path):
+    every_10_ms = [line.split() for line in poses("s").splitlines()]
+    text = "".join(" ".join([f"{10 * k}", *line[1:]]) + "\n" for k, line in enumerate(every_10_ms))
+    with pytest.raises(EbarfError, match=r"in s and in ms; expected --pose-time-unit.*: 1 in s, 200 in ms\)"):
+        odometry(tmp_path, text)
+    with pytest.raises(EbarfError, match="1 of them among the events, which span 1.999 s; expected one unit of time"):
+        sparse = "".join(" ".join([f"{250 * k}", *line[1:]]) + "\n" for k, line in enumerate(every_10_ms))
+        odometry(tmp_path, sparse, trajectory_format=TrajectoryFormat("s"))
+    assert not (tmp_path / "scene").exists()
+    said, suspicions = odometry(tmp_path, text, trajectory_format=TrajectoryFormat("ms"))
+    assert any("201 keyframes around the events" in sentence for sentence in said), said
+    assert not any("another unit" in sentence for sentence in suspicions)
+
+
+def test_a_window_between_two_poses_is_a_suspicion(tmp_path: Path):
+    window = Intake(start_us=100_000, end_us=104_000)
+    said, suspicions = odometry(tmp_path, poses("s"), events=window)
+    assert any("0 of them among the events" in sentence for sentence in said), said
+    assert any("lie between keyframes 0 and 1, 8.33 ms apart: times in another unit?" in one for one in suspicions)
+
+
+def test_a_torn_trajectory_is_said_and_suspected(tmp_path: Path):
+    lines = [line.split() for line in poses("s").splitlines()]
+    text = "".join(" ".join([t, f"{float(x) + 3 * (k > 99)}", *rest]) + "\n" for k, (t, x, *rest) in enumerate(lines))
+    for sentences in odometry(tmp_path, text):
+        assert any("between keyframes 99 and 100 (8.33 ms" in sentence for sentence in sentences), sentences
+
+
+def test_a_scene_saved_with_byte_order_marks_is_read(tmp_path: Path):
+    odometry(tmp_path, poses("s"))
+    for name in ("scene.json", "trajectory.txt"):
+        path = tmp_path / "scene" / name
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode("utf-8-sig"))
+    assert inspect_scene(tmp_path / "scene").keyframes > 200
 
 
 def test_a_zip_is_as_good_as_its_folder(tmp_path: Path):

@@ -19,7 +19,7 @@ _QUATERNION_TOLERANCE = 1e-3
 def read_tum(path: Path) -> Trajectory:
     """Read a TUM file into float64 poses; raises :class:`TrajectoryError` naming file, line, value and expectation."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error})") from None
     times_us: list[int] = []

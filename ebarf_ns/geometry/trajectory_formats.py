@@ -6,87 +6,79 @@ of a quaternion's columns cannot: every order is a rotation as smooth as the rig
 
 from __future__ import annotations
 
-import re
 import struct
-from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
-from typing import IO, Literal, get_args
+from typing import IO
 
 import h5py
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import TrajectoryError
 from ebarf_ns.files import opened_npz
-from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes
+from ebarf_ns.geometry.raw_poses import (
+    NOTHING_KNOWN,
+    Axes,
+    Quaternion,
+    RawPoses,
+    TimeUnit,
+    TrajectoryFormat,
+    Transform,
+    check_lengths,
+    moving,
+    rotations,
+    times_beside,
+)
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
+from ebarf_ns.geometry.trajectory_text import read_text
+from ebarf_ns.geometry.trajectory_units import US, recognised_unit
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
-Quaternion = Literal["xyzw", "wxyz", "yzwx"]
-Transform = Literal["camera-to-world", "world-to-camera"]
-Axes = Literal["opencv", "opengl", "llff"]
+__all__ = [
+    "NOTHING_KNOWN",
+    "Axes",
+    "Quaternion",
+    "RawPoses",
+    "TrajectoryFormat",
+    "Transform",
+    "read_raw",
+    "read_trajectory",
+    "trajectory_of",
+]
 
-_US: dict[TimeUnit, Decimal] = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
 # Of the file's axes, what x, y and z of OpenCV are: LLFF has down, right, back.
 _AXES: dict[Axes, np.ndarray] = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "llff": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
 }
-_SPACINGS_S = (1e-4, 10.0)
-_SINCE_1970_US, _SINCE_1970_NS = 1e14, 1e17
-_UNIT_LENGTH = 1e-3
-_DIGITS = 30
 
 
-@dataclass(frozen=True)
-class TrajectoryFormat:
-    """What to know of a trajectory's file where the file itself does not say."""
-
-    pose_time_unit: TimeUnit | None = None
-    """Of its times; recognised from their spacing where not given."""
-    quaternion: Quaternion | None = None
-    """Order of the quaternion's columns: TUM's xyzw, wxyz, or the yzwx of some files of DEVO and DEIO."""
-    transform: Transform | None = None
-    """Of its poses; COLMAP's are world-to-camera, all others camera-to-world where not given."""
-    axes: Axes | None = None
-    """Of its cameras; LLFF's are its own, all others OpenCV's where not given."""
-    pose_times: Path | None = None
-    """A time for each pose, for files without (KITTI, LLFF, COLMAP): a line each, "time" or "name time"."""
-
-
-NOTHING_KNOWN = TrajectoryFormat()
-
-
-@dataclass(frozen=True)
-class _Raw:
-    """A file's content before conventions are applied."""
-
-    format: str
-    times: list[Decimal]
-    position: Float[np.ndarray, "poses 3"]
-    rotation: Float[np.ndarray, "poses 4"] | Float[np.ndarray, "poses 3 3"]
-    """Quaternions in the file's order, or matrices."""
-    quaternion: Quaternion | None = None
-    """As the format has it; None: not to be known."""
-    transform: Transform = "camera-to-world"
-    axes: Axes = "opencv"
-    time_unit: TimeUnit | None = None
-
-
-def read_trajectory(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> tuple[Trajectory, list[str]]:
+def read_trajectory(
+    path: Path, known: TrajectoryFormat = NOTHING_KNOWN, span_us: tuple[int, int] | None = None
+) -> tuple[Trajectory, list[str]]:
     """Poses in order of time, and what was recognised; raises :class:`TrajectoryError`.
 
-    TUM text in any unit, TUM-VIE's ``mocap_data.txt``, EDS' ground truth, KITTI, COLMAP's ``images.txt`` and
-    ``images.bin`` (or the folder of either), LLFF's ``poses_bounds.npy``, Robust e-NeRF's ``camera_poses.npz``,
-    M3ED's ``*_pose_gt.h5``.
+    TUM text in any unit, text with a line that names its columns, TUM-VIE's ``mocap_data.txt``, EuRoC's ``data.csv``,
+    EDS' ground truth, KITTI, COLMAP's ``images.txt`` and ``images.bin`` (or the folder of either), matrices as npy,
+    LLFF's ``poses_bounds.npy``, Robust e-NeRF's ``camera_poses.npz``, M3ED's ``*_pose_gt.h5``. ``span_us`` is of what
+    the poses are for, and helps to tell the unit of their times.
     """
-    raw = _read(path, known)
-    unit = known.pose_time_unit or raw.time_unit or _recognised_unit(path, raw.times)
-    quaternion = known.quaternion or raw.quaternion
-    if raw.rotation.ndim == 2 and quaternion is None:
+    return trajectory_of(path, read_raw(path, known), known, span_us)
+
+
+def trajectory_of(
+    path: Path, raw: RawPoses, known: TrajectoryFormat = NOTHING_KNOWN, span_us: tuple[int, int] | None = None
+) -> tuple[Trajectory, list[str]]:
+    """What :func:`read_trajectory` makes of a file that was read."""
+    _check_numbers(path, raw)
+    unit = known.pose_time_unit or raw.time_unit or recognised_unit(path, raw.times, span_us)
+    quaternion, doubtful = known.quaternion or raw.quaternion, False
+    if not raw.order_told and quaternion is None:
+        quaternion, doubtful = "xyzw", order_is_doubtful(path, raw, known, span_us)
+    if doubtful:
         raise TrajectoryError(
             f"{path}: times in {unit} with a point and no line of names are how DEVO and DEIO write quaternions as "
             "qy qz qw qx; expected --quaternion yzwx for that, or xyzw"
@@ -96,50 +88,60 @@ def read_trajectory(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> tupl
     poses = _camera_to_world(raw, quaternion, transform, axes)
     order = torch.argsort(t_us, stable=True)
     trajectory = Trajectory(t_us[order], Poses(*(column[order] for column in poses)))
-    try:
-        check_keyframes(trajectory.t_us)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
+    for before, after in pairwise(order.tolist()):
+        if t_us[before] == t_us[after]:
+            raise TrajectoryError(
+                f"{raw.place(path, after)}: times {raw.times[before]} and {raw.times[after]} in {unit} are in one "
+                "microsecond, expected a microsecond or more between poses"
+            )
     columns = "" if raw.rotation.ndim == 3 else f", quaternions {' '.join(quaternion or '')}"
     notes = [f"{path.name}: {raw.format}, {len(t_us)} poses, times in {unit}{columns}, {transform}, {axes} axes"]
-    if not bool((order == torch.arange(len(order))).all()):
-        notes.append(f"{path.name}: poses were not in order of time, and are sorted")
-    return trajectory, notes
+    earlier = torch.nonzero(t_us.diff() < 0).flatten().tolist()
+    if earlier:
+        place = raw.place(path, earlier[0] + 1).removeprefix(f"{path.parent}/")
+        others = f", as {len(earlier) - 1} others," if len(earlier) > 1 else ""
+        notes.append(
+            f"{place}{others} is earlier than the pose before; poses were not in order of time, and are sorted"
+        )
+    return trajectory, [*notes, *raw.notes]
 
 
-def order_is_known(path: Path, known: TrajectoryFormat) -> bool:
-    """Whether the order of the quaternions is told by ``known``, by the file, or needs none."""
-    raw = _read(path, known)
-    return raw.rotation.ndim == 3 or bool(known.quaternion or raw.quaternion)
+def order_is_doubtful(
+    path: Path, raw: RawPoses, known: TrajectoryFormat, span_us: tuple[int, int] | None = None
+) -> bool:
+    """Whether the order of quaternions has to be asked for: microseconds written as floats, without names, are the
+    mark of one family of odometry."""
+    if raw.order_told or known.quaternion or not raw.pointed:
+        return False
+    return (known.pose_time_unit or raw.time_unit or recognised_unit(path, raw.times, span_us)) == "us"
+
+
+def _check_numbers(path: Path, raw: RawPoses) -> None:
+    """Raise :class:`TrajectoryError` unless there are two poses or more of finite numbers, each at its own time."""
+    if len(raw.times) < 2:
+        raise TrajectoryError(f"{path}: holds {len(raw.times)} pose{'s'[: not raw.times]}, expected 2 or more")
+    values = np.concatenate([raw.position, raw.rotation.reshape(len(raw.times), -1)], axis=1)
+    finite = np.isfinite(values).all(axis=1) & [time.is_finite() for time in raw.times]
+    if not finite.all():
+        raise TrajectoryError(f"{raw.place(path, int(finite.argmin()))}: a number is not finite, expected a pose")
+    seen: dict[Decimal, int] = {}
+    for k, time in enumerate(raw.times):
+        if (first := seen.setdefault(time, k)) != k:
+            where = "" if first == k - 1 else f", as in {raw.place(path, first).removeprefix(f'{path}:').strip()}"
+            where = where.replace("as in ", "as in line ") if raw.places else where
+            raise TrajectoryError(f"{raw.place(path, k)}: time {time} again{where}, expected times that increase")
+    if raw.rotation.ndim == 2:
+        check_lengths(raw.rotation, [raw.place(path, k) for k in range(len(raw.times))])
 
 
 def _in_us(path: Path, time: Decimal, unit: TimeUnit) -> int:
-    t_us = int((time * _US[unit]).to_integral_value())
+    t_us = int((time * US[unit]).to_integral_value())
     if abs(t_us) >= 1 << 61:
         raise TrajectoryError(f"{path}: time {time} in {unit} does not fit 64-bit microseconds, expected another unit")
     return t_us
 
 
-def _recognised_unit(path: Path, times: list[Decimal]) -> TimeUnit:
-    """The unit in which poses come a tenth of a millisecond to ten seconds apart."""
-    spacing = float(np.median(np.abs(np.diff(np.array(times, dtype=float))))) if len(times) > 1 else 0.0
-    units: tuple[TimeUnit, ...] = ("s", "us", "ns")
-    fitting: list[TimeUnit] = [
-        unit for unit in units if _SPACINGS_S[0] <= spacing * float(_US[unit]) * 1e-6 <= _SPACINGS_S[1]
-    ]
-    if fitting == ["us", "ns"] and float(max(times)) > _SINCE_1970_US:
-        # A tenth of a second or more in microseconds, or as little as a tenth of a millisecond in nanoseconds: since
-        # 1970, nanoseconds have grown by 18 digits, and microseconds by 15.
-        fitting = ["ns"] if float(max(times)) > _SINCE_1970_NS else ["us"]
-    if len(fitting) != 1:
-        raise TrajectoryError(
-            f"{path}: poses are {spacing:g} apart (median), which is a plausible spacing in "
-            f"{' and in '.join(fitting) or 'no unit'}; expected --pose-time-unit"
-        )
-    return fitting[0]
-
-
-def _camera_to_world(raw: _Raw, quaternion: Quaternion | None, transform: Transform, axes: Axes) -> Poses:
+def _camera_to_world(raw: RawPoses, quaternion: Quaternion | None, transform: Transform, axes: Axes) -> Poses:
     if raw.rotation.ndim == 2:
         order = [(quaternion or "xyzw").index(name) for name in "xyzw"]
         rotation = Rotation.from_quat(raw.rotation[:, order])
@@ -153,7 +155,8 @@ def _camera_to_world(raw: _Raw, quaternion: Quaternion | None, transform: Transf
     return Poses(torch.from_numpy(position.copy()), torch.from_numpy(rotation.as_quat()[:, [3, 0, 1, 2]].copy()))
 
 
-def _read(path: Path, known: TrajectoryFormat) -> _Raw:
+def read_raw(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> RawPoses:
+    """A file's content; raises :class:`TrajectoryError`."""
     if path.is_dir():
         models = [path / name for name in ("images.bin", "images.txt") if (path / name).is_file()]
         if not models:
@@ -163,124 +166,69 @@ def _read(path: Path, known: TrajectoryFormat) -> _Raw:
         if path.suffix == ".npz":
             return _robust_e_nerf(path)
         if path.suffix == ".npy":
-            return _llff(path, known)
+            return _npy(path, known)
         if path.suffix in (".h5", ".hdf5"):
             return _m3ed(path)
         if path.suffix == ".bin":
             return _colmap(path, _colmap_binary(path), known)
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError, ValueError, EOFError, struct.error, KeyError) as error:
         raise TrajectoryError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     if path.name == "images.txt":
         return _colmap(path, _colmap_text(path, lines), known)
-    return _text(path, lines, known)
+    return read_text(path, lines, known)
 
 
-def _text(path: Path, lines: list[str], known: TrajectoryFormat) -> _Raw:
-    """TUM's eight columns, KITTI's twelve, or a 4x4 matrix, with or without a time before it."""
-    rows: list[list[Decimal]] = []
-    header, named, pointed = "", False, False
-    for number, line in enumerate(lines, start=1):
-        fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
-        if not fields:
-            header += "" if rows else line + "\n"
-            continue
-        values = [_number(field) for field in fields]
-        if None in values:
-            if rows or named:
-                raise TrajectoryError(f"{path}:{number}: {line.strip()!r:.60} is no pose, expected numbers")
-            header, named = header + line + "\n", True
-            continue
-        if rows and len(values) != len(rows[0]):
-            raise TrajectoryError(f"{path}:{number}: {len(values)} columns, expected {len(rows[0])} as before")
-        pointed |= "." in fields[0]
-        rows.append([value for value in values if value is not None])
-    if not rows:
-        raise TrajectoryError(f"{path}: holds no poses")
-    count = len(rows[0])
-    if count == 8:
-        return _tum(path, rows, header.lower(), pointed)
-    if count in (12, 13, 16, 17):
-        timed = count in (13, 17)
-        numbers = np.array([row[timed:] for row in rows], float).reshape(len(rows), -1, 4)
-        times = [row[0] for row in rows] if timed else _times(path, len(rows), None, known)
-        return _Raw("matrices", times, numbers[:, :3, 3], _rotations(path, numbers[:, :3, :3]))
-    raise TrajectoryError(f"{path}: {count} columns, expected 8 (TUM), or 12 or 16 (matrices) with or without a time")
-
-
-def _number(text: str) -> Decimal | None:
-    try:
-        value = Decimal(text)
-    except InvalidOperation:
-        return None
-    return value if value.is_finite() and value.adjusted() < _DIGITS else None
-
-
-def _tum(path: Path, rows: list[list[Decimal]], header: str, pointed: bool) -> _Raw:
-    numbers = np.array([row[1:] for row in rows], float)
-    length = np.linalg.norm(numbers[:, 3:], axis=1)
-    if (wrong := np.abs(length - 1) > _UNIT_LENGTH).any():
-        k = int(wrong.argmax())
-        raise TrajectoryError(f"{path}: the quaternion of pose {k} has length {length[k]:.6g}, expected 1")
-    times = [row[0] for row in rows]
-    unit: TimeUnit | None = next((one for one in ("ns", "us") if f"[{one}]" in header), None)
-    unit = "s" if unit is None and ("[s]" in header or "[secs]" in header) else unit
-    # "qx qy qz qw", or EuRoC's "q_RS_w [], q_RS_x [], ...".
-    order = "".join(re.findall(r"\bq\w*?([wxyz])\b", header))
-    said: Quaternion | None = next((one for one in get_args(Quaternion) if one == order), None)
-    # Microseconds written as floats, without names, are the mark of one family of odometry.
-    doubtful = pointed and (unit or _recognised_unit(path, times)) == "us"
-    quaternion = said or (None if doubtful else "xyzw")
-    return _Raw("TUM text", times, numbers[:, :3], numbers[:, 3:], quaternion, time_unit=unit)
-
-
-def _rotations(path: Path, matrices: Float[np.ndarray, "poses 3 3"]) -> Float[np.ndarray, "poses 3 3"]:
-    off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = (off > 10 * _UNIT_LENGTH) | (np.linalg.det(matrices) < 0)
-    if wrong.any():
-        k = int(wrong.argmax())
-        raise TrajectoryError(f"{path}: the matrix of pose {k} is no rotation (off by {off[k]:.3g}), expected one")
-    return matrices
-
-
-def _robust_e_nerf(path: Path) -> _Raw:
+def _robust_e_nerf(path: Path) -> RawPoses:
     with opened_npz(path) as file:
         times = [Decimal(int(t)) for t in file["T_wc_timestamp"]]
         position, rotation = file["T_wc_position"].astype(float), file["T_wc_orientation"].astype(float)
-    return _Raw("Robust e-NeRF npz", times, position, rotation, "xyzw", time_unit="ns")
+    return RawPoses("Robust e-NeRF npz", times, position, rotation, "xyzw", time_unit="ns")
 
 
-def _m3ed(path: Path) -> _Raw:
+def _m3ed(path: Path) -> RawPoses:
     """Chaney et al. 2023: ``Cn_T_C0`` brings points of the first event camera, which is the world, into the n-th."""
     with h5py.File(path, "r") as file:
         matrices, times = np.asarray(file["Cn_T_C0"], float), np.asarray(file["ts"])
     if matrices.shape != (len(times), 4, 4):
         raise TrajectoryError(f"{path}: Cn_T_C0 is of shape {matrices.shape}, expected ({len(times)}, 4, 4)")
-    rotation = _rotations(path, matrices[:, :3, :3])
+    rotation = rotations(path, matrices[:, :3, :3])
     times = [Decimal(str(time)) for time in times.tolist()]
-    return _Raw("M3ED poses", times, matrices[:, :3, 3], rotation, None, "world-to-camera", time_unit="us")
+    return RawPoses("M3ED poses", times, matrices[:, :3, 3], rotation, None, "world-to-camera", time_unit="us")
 
 
-def _llff(path: Path, known: TrajectoryFormat) -> _Raw:
+def _npy(path: Path, known: TrajectoryFormat) -> RawPoses:
+    """LLFF's table, or matrices, flat or not."""
     table = np.load(path).astype(float)
-    if table.ndim != 2 or table.shape[1] not in (15, 17):
-        raise TrajectoryError(f"{path}: an array of shape {table.shape}, expected LLFF's (poses, 17)")
-    matrices = table[:, :15].reshape(-1, 3, 5)
-    times = _times(path, len(table), None, known)
-    return _Raw("LLFF", times, matrices[..., 3], _rotations(path, matrices[..., :3]), axes="llff")
+    shape, count = table.shape, len(table) if table.ndim else 0
+    if shape[1:] == (3, 5):
+        table, shape = table.reshape(-1, 15), (count, 15)
+    timed = shape[1:] in ((13,), (17,)) and (shape[1] == 13 or bool((table[:, 13:] == [0, 0, 0, 1]).all()))
+    if table.ndim == 2 and shape[1] in (15, 17) and not timed and count:
+        matrices = table[:, :15].reshape(-1, 3, 5)
+        times = times_beside(path, count, None, known)
+        return RawPoses("LLFF", times, matrices[..., 3], rotations(path, matrices[..., :3]), axes="llff")
+    if not count or not (timed or shape[1:] in ((12,), (16,), (3, 4), (4, 4))):
+        raise TrajectoryError(
+            f"{path}: an array of shape {shape}, expected matrices (poses, 4, 4) or (poses, 3, 4), or LLFF's "
+            "(poses, 17)"
+        )
+    position, rotation = moving(path, (table[:, 1:] if timed else table).reshape(count, -1, 4))
+    own = [Decimal(repr(time)) for time in table[:, 0].tolist()] if timed else None
+    return RawPoses("matrices", own or times_beside(path, count, None, known), position, rotation)
 
 
 Images = list[tuple[str, list[float]]]
 """COLMAP's: names, and qw qx qy qz tx ty tz of the world in the camera."""
 
 
-def _colmap(path: Path, images: Images, known: TrajectoryFormat) -> _Raw:
+def _colmap(path: Path, images: Images, known: TrajectoryFormat) -> RawPoses:
     if not images:
         raise TrajectoryError(f"{path}: holds no image, expected a COLMAP model with some")
     images = sorted(images)
     numbers = np.array([pose for _, pose in images])
-    times = _times(path, len(images), [name for name, _ in images], known)
-    return _Raw("COLMAP model", times, numbers[:, 4:], numbers[:, :4], "wxyz", "world-to-camera")
+    times = times_beside(path, len(images), [name for name, _ in images], known)
+    return RawPoses("COLMAP model", times, numbers[:, 4:], numbers[:, :4], "wxyz", "world-to-camera")
 
 
 def _colmap_text(path: Path, lines: list[str]) -> Images:
@@ -319,36 +267,3 @@ def _until_zero(file: IO[bytes]) -> str:
             raise struct.error("a name is cut short")
         name += byte
     return name.decode()
-
-
-def _times(path: Path, count: int, names: list[str] | None, known: TrajectoryFormat) -> list[Decimal]:
-    """From the file that has them, by name where it has names."""
-    if known.pose_times is None:
-        raise TrajectoryError(f"{path}: has no times, expected --pose-times with a line for each of its {count} poses")
-    times: dict[str, Decimal] = {}
-    try:
-        lines = known.pose_times.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise TrajectoryError(f"{known.pose_times}: cannot be read ({reason}), expected a time a line") from None
-    for number, line in enumerate(lines, start=1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
-        # "time", "name time", where the name may be a number, or "time name".
-        values = [_number(field) for field in fields[:2]]
-        place = len(values) - 1 if values[-1] is not None else 0
-        time = values[place]
-        if time is None:
-            if number == 1:
-                continue
-            raise TrajectoryError(f"{known.pose_times}:{number}: {line!r:.60}, expected a time or a name and a time")
-        name = Path(fields[1 - place]).name if len(fields) > 1 else str(len(times))
-        times[name] = time
-    if names is not None and all(Path(name).name in times for name in names):
-        return [times[Path(name).name] for name in names]
-    if len(times) != count:
-        raise TrajectoryError(
-            f"{known.pose_times}: {len(times)} times, expected one for each of the {count} poses of {path}"
-        )
-    return list(times.values())

@@ -202,8 +202,8 @@ def test_robust_e_nerf(tmp_path: Path):
         ("0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n", "has length 2, expected 1"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 zero 0 0 1\n", ":2: "),
         ("0 0 0 0 0 0 0 1\n1 0 0\n", "3 columns, expected 8 as before"),
-        ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "plausible spacing in no unit"),
-        ("0 0 0 0 0 0 0 1\n50 0 0 0 0 0 0 1\n", "plausible spacing in no unit"),
+        ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", ":2: time 0 again, expected times that increase"),
+        ("0 0 0 0 0 0 0 1\n1e11 0 0 0 0 0 0 1\n", "plausible spacing in no unit"),
         ("2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, "is no rotation"),
     ],
 )

@@ -1,0 +1,166 @@
+"""Poses as a file has them, before its conventions are applied, and what to know of them where it does not say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from ebarf_ns.errors import TrajectoryError
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+Quaternion = Literal["xyzw", "wxyz", "yzwx"]
+Transform = Literal["camera-to-world", "world-to-camera"]
+Axes = Literal["opencv", "opengl", "llff"]
+
+_UNIT_LENGTH = 1e-3
+"""Further off unit length than this is a different mistake than rounding."""
+_DIGITS = 30
+
+
+@dataclass(frozen=True)
+class TrajectoryFormat:
+    """What to know of a trajectory's file where the file itself does not say."""
+
+    pose_time_unit: TimeUnit | None = None
+    """Of its times; recognised from their spacing where not given."""
+    quaternion: Quaternion | None = None
+    """Order of the quaternion's columns: TUM's xyzw, wxyz, or the yzwx of some files of DEVO and DEIO."""
+    transform: Transform | None = None
+    """Of its poses; COLMAP's are world-to-camera, all others camera-to-world where not given."""
+    axes: Axes | None = None
+    """Of its cameras; LLFF's are its own, all others OpenCV's where not given."""
+    pose_times: Path | None = None
+    """A time for each pose, for files without (KITTI, LLFF, COLMAP): a line each, "time" or "name time"."""
+
+
+NOTHING_KNOWN = TrajectoryFormat()
+
+
+@dataclass(frozen=True)
+class RawPoses:
+    """A file's content before conventions are applied."""
+
+    format: str
+    times: list[Decimal]
+    position: Float[np.ndarray, "poses 3"]
+    rotation: Float[np.ndarray, "poses 4"] | Float[np.ndarray, "poses 3 3"]
+    """Quaternions in the file's order, or matrices."""
+    quaternion: Quaternion | None = None
+    """As the file or its format has it; None: it does not say."""
+    transform: Transform = "camera-to-world"
+    axes: Axes = "opencv"
+    time_unit: TimeUnit | None = None
+    pointed: bool = False
+    """Whether times are written with a decimal point."""
+    places: tuple[str, ...] = ()
+    """Where each pose stands, for messages; the line of a text file."""
+    notes: tuple[str, ...] = ()
+
+    def place(self, path: Path, pose: int) -> str:
+        """Of a pose, as messages begin."""
+        return self.places[pose] if self.places else f"{path}: pose {pose}"
+
+    @property
+    def order_told(self) -> bool:
+        """Whether the file tells the order of its quaternions, or needs none."""
+        return self.rotation.ndim == 3 or self.quaternion is not None
+
+
+def number(text: str) -> Decimal | None:
+    """A finite number of no absurd size, or None."""
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        return None
+    return value if value.is_finite() and value.adjusted() < _DIGITS else None
+
+
+def check_lengths(quaternions: Float[np.ndarray, "poses 4"], places: Sequence[str]) -> None:
+    """Raise :class:`TrajectoryError` where one is not of unit length."""
+    length = np.linalg.norm(quaternions, axis=1)
+    if (wrong := np.abs(length - 1) > _UNIT_LENGTH).any():
+        k = int(wrong.argmax())
+        raise TrajectoryError(f"{places[k]}: the quaternion has length {length[k]:.6g}, expected 1")
+
+
+def rotations(
+    path: Path, matrices: Float[np.ndarray, "poses 3 3"], places: tuple[str, ...] = ()
+) -> Float[np.ndarray, "poses 3 3"]:
+    """The matrices; raises :class:`TrajectoryError` where one is no rotation."""
+    off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = ~(off <= 10 * _UNIT_LENGTH)
+    wrong[~wrong] = np.linalg.det(matrices[~wrong]) < 0
+    if wrong.any():
+        k = int(wrong.argmax())
+        place = f"{places[k]}: the matrix" if places else f"{path}: the matrix of pose {k}"
+        raise TrajectoryError(f"{place} is no rotation (off by {off[k]:.3g}), expected one")
+    return matrices
+
+
+def moving(
+    path: Path, matrices: Float[np.ndarray, "poses rows 4"], places: tuple[str, ...] = ()
+) -> tuple[Float[np.ndarray, "poses 3"], Float[np.ndarray, "poses 3 3"]]:
+    """Positions and rotations of 3x4 or 4x4 matrices, the last row of which is 0 0 0 1."""
+    if matrices.shape[1] == 4:
+        wrong = ~(np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= _UNIT_LENGTH).all(axis=1)
+        if wrong.any():
+            k = int(wrong.argmax())
+            place = f"{places[k]}: the last row" if places else f"{path}: the last row of matrix {k}"
+            row = " ".join(f"{value:g}" for value in matrices[k, 3])
+            raise TrajectoryError(
+                f"{place} is {row}, expected 0 0 0 1 of a 4x4 matrix{', or a line of names above' if places else ''}"
+            )
+    return matrices[:, :3, 3], rotations(path, matrices[:, :3, :3], places)
+
+
+def times_beside(path: Path, count: int, names: list[str] | None, known: TrajectoryFormat) -> list[Decimal]:
+    """From the file that has them, by name where it has names."""
+    if known.pose_times is None:
+        raise TrajectoryError(f"{path}: has no times, expected --pose-times with a line for each of its {count} poses")
+    times = _listed(known.pose_times)
+    if names is not None and all(Path(name).name in times for name in names):
+        return [times[Path(name).name] for name in names]
+    if len(times) != count:
+        raise TrajectoryError(
+            f"{known.pose_times}: {len(times)} times, expected one for each of the {count} poses of {path}"
+        )
+    return list(times.values())
+
+
+def _listed(path: Path) -> dict[str, Decimal]:
+    """Times by name, or by number where there are no names."""
+    times: dict[str, Decimal] = {}
+    try:
+        if path.suffix == ".npy":
+            return {str(k): Decimal(str(time)) for k, time in enumerate(np.load(path).ravel().tolist())}
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError, InvalidOperation) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TrajectoryError(f"{path}: cannot be read ({reason}), expected a time a line") from None
+    first = True
+    for line_number, line in enumerate(lines, start=1):
+        fields = line.split("#")[0].replace(",", " ").split()
+        if not fields:
+            continue
+        # "time", "name time", where the name may be a number, or "time name".
+        values = [number(field) for field in fields[:2]]
+        place = len(values) - 1 if values[-1] is not None else 0
+        time = values[place]
+        if time is None:
+            # A line of names has no digit in front.
+            if first and not any(field[0].isdigit() for field in fields[:2]):
+                first = False
+                continue
+            raise TrajectoryError(f"{path}:{line_number}: {line!r:.60}, expected a time or a name and a time")
+        first = False
+        name = Path(fields[1 - place]).name if len(fields) > 1 else str(len(times))
+        if name in times:
+            raise TrajectoryError(f"{path}:{line_number}: {name} again, expected one time for each name")
+        times[name] = time
+    return times

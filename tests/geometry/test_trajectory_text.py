@@ -1,0 +1,187 @@
+"""Columns by name, first lines with mistakes, times that are equal or in an unknown unit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
+from tests.geometry.test_trajectory_formats import COUNT, POSITION, QUAT, T_US, check, matrices, rows, seconds, tum
+
+WXYZ = QUAT[:, [3, 0, 1, 2]]
+NS = [str(1000 * t) for t in T_US.tolist()]
+
+
+def table(header: str, *columns: object) -> str:
+    """Comma-separated, below a line of names; a number alone stands for itself in every line."""
+    lines = [header]
+    for k in range(COUNT):
+        cells = []
+        for column in columns:
+            value = column if isinstance(column, str) else column[k]  # pyright: ignore[reportIndexIssue]
+            cells += [f"{v:.12f}" for v in value] if isinstance(value, np.ndarray) else [str(value)]
+        lines.append(",".join(cells))
+    return "\n".join(lines) + "\n"
+
+
+EUROC = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)
+STAMPED = "field.header.stamp,field.header.frame_id"
+POINT = ",".join(f"field.pose.position.{axis}" for axis in "xyz")
+ORIENTATION = ",".join(f"field.pose.orientation.{axis}" for axis in "xyzw")
+SECS = [str(t // 10**6) for t in T_US.tolist()]
+NSECS = [str(t % 10**6 * 1000) for t in T_US.tolist()]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            table(EUROC, NS, POSITION, WXYZ, *["0.5"] * 9),
+            "left out: 9 other columns (v_RS_R_x, v_RS_R_y, v_RS_R_z, ...",
+        ),
+        (
+            table(f"%time,{STAMPED},{POINT},{ORIENTATION}", "7", NS, "world", POSITION, QUAT),
+            "left out: 2 other columns",
+        ),
+        (
+            table(
+                f"Time,header.stamp.secs,header.stamp.nsecs,frame,{POINT},{ORIENTATION}",
+                "1",
+                SECS,
+                NSECS,
+                "",
+                POSITION,
+                QUAT,
+            ),
+            "left out: 2 other columns (Time, frame)",
+        ),
+        (table("id,timestamp [us],tx,ty,tz,qw,qx,qy,qz", [*map(str, range(COUNT))], T_US, POSITION, WXYZ), "(id)"),
+        (table(",t_us,x,y,z,qx,qy,qz,qw", [*map(str, range(COUNT))], T_US, POSITION, QUAT), "(one without a name)"),
+        (table("q_w,q_x,q_y,q_z,p_x,p_y,p_z,time_ns", WXYZ, POSITION, NS), "times in ns, quaternions w x y z"),
+        (table("Time [ns],Pos X,Pos Y,Pos Z,Quat X,Quat Y,Quat Z,Quat W", NS, POSITION, QUAT), "TUM text"),
+        (table("# made today", [*map(str, range(COUNT))], seconds(T_US), POSITION, QUAT), "which counts the lines"),
+    ],
+)
+def test_names_tell_where_a_pose_is(tmp_path: Path, text: str, said: str):
+    for name, content, encoding in (
+        ("t.csv", text, "utf-8"),
+        ("crlf.csv", text.replace("\n", "\r\n"), "utf-8-sig"),
+        ("semicolons.csv", text.replace(",", ";"), "utf-8"),
+    ):
+        (tmp_path / name).write_bytes(content.encode(encoding))
+        trajectory, notes = read_trajectory(tmp_path / name)
+        check(trajectory)
+        assert any(said in note for note in notes), notes
+
+
+def test_two_columns_of_one_name_are_an_error(tmp_path: Path):
+    (tmp_path / "t.csv").write_text(table("t,a.p.x,b.p.x,p_y,p_z,qx,qy,qz,qw", seconds(T_US), "0", POSITION, QUAT))
+    with pytest.raises(TrajectoryError, match=r"a\.p\.x and b\.p\.x mean the same"):
+        read_trajectory(tmp_path / "t.csv")
+
+
+def test_a_byte_order_mark_costs_no_pose(tmp_path: Path):
+    (tmp_path / "bom.txt").write_bytes(tum("s").replace("\n", "\r\n").encode("utf-8-sig"))
+    check(read_trajectory(tmp_path / "bom.txt")[0])
+    check(read_tum(tmp_path / "bom.txt"))
+    np.save(tmp_path / "poses.npy", matrices())
+    (tmp_path / "times.txt").write_bytes("\n".join(seconds(T_US)).encode("utf-8-sig"))
+    check(read_trajectory(tmp_path / "poses.npy", TrajectoryFormat(pose_times=tmp_path / "times.txt"))[0])
+
+
+@pytest.mark.parametrize(
+    "first", ["0.0OO 0 0 0 0 0 0 1", "nan 0 0 0 0 0 0 1", "O.0 0 0 0 0 0 0 1", "0,0 0 0 0 0 0 0 1", "0"]
+)
+def test_a_first_line_with_a_mistake_is_no_line_of_names(tmp_path: Path, first: str):
+    (tmp_path / "t.txt").write_text("# a comment\n" + first + "\n" + tum("s"))
+    with pytest.raises(TrajectoryError, match=r"t\.txt:2: .*expected"):
+        read_trajectory(tmp_path / "t.txt")
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (["1604644894.000000"] * COUNT, "t.txt:2: time 1604644894.000000 again, expected times that increase"),
+        ([str(k - (k == 6)) for k in range(COUNT)], "t.txt:7: time 5 again, expected"),
+        ([str(k % 6) for k in range(COUNT)], "t.txt:7: time 0 again, as in line 1, expected"),
+        (["5"], "t.txt: holds 1 pose, expected 2"),
+        ([f"{k * 0.05 + (k == 3) * -0.0499999:.7f}" for k in range(COUNT)], "are in one microsecond"),
+    ],
+)
+def test_equal_times_are_named(tmp_path: Path, times: list[str], words: str):
+    (tmp_path / "t.txt").write_text(rows(times, np.hstack([POSITION, QUAT])[: len(times)]))
+    with pytest.raises(TrajectoryError) as caught:
+        read_trajectory(tmp_path / "t.txt")
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("rate", [500, 200, 100, 60, 30, 20, 10, 5])
+@pytest.mark.parametrize("start_ms", [0, 1_604_644_894_000])
+def test_milliseconds_are_asked_for_where_another_unit_is_as_plausible(tmp_path: Path, rate: int, start_ms: int):
+    times_ms = [start_ms + 1000 * k / rate for k in range(COUNT)]
+    (tmp_path / "t.txt").write_text(rows([f"{t:.3f}" for t in times_ms], np.hstack([POSITION, QUAT])))
+    t_us = np.array([round(1000 * float(f"{t:.3f}")) for t in times_ms])
+    if start_ms == 0 and rate in (500, 200, 100, 10, 5):
+        other = "s and in ms" if rate >= 100 else "ms and in us"
+        with pytest.raises(TrajectoryError, match=f"plausible spacing in {other}; expected --pose-time-unit"):
+            read_trajectory(tmp_path / "t.txt", span_us=(0, int(t_us[-1])))
+    else:
+        check(read_trajectory(tmp_path / "t.txt")[0], t_us)
+    check(read_trajectory(tmp_path / "t.txt", TrajectoryFormat("ms"))[0], t_us)
+    (tmp_path / "named.txt").write_text("# time [ms] x y z qx qy qz qw\n" + (tmp_path / "t.txt").read_text())
+    check(read_trajectory(tmp_path / "named.txt")[0], t_us)
+
+
+@pytest.mark.parametrize(("unit_us", "step"), [(10**6, 1), (10**6, 5), (1, 200)])
+def test_the_events_tell_seconds_and_microseconds_from_milliseconds(tmp_path: Path, unit_us: int, step: int):
+    t_us = unit_us * step * np.arange(COUNT)
+    (tmp_path / "t.txt").write_text(rows([str(step * k) for k in range(COUNT)], np.hstack([POSITION, QUAT])))
+    check(read_trajectory(tmp_path / "t.txt", span_us=(int(t_us[2]), int(t_us[-2])))[0], t_us)
+
+
+@pytest.mark.parametrize("shape", [(-1, 4, 4), (-1, 3, 4), (-1, 16), (-1, 12)])
+def test_matrices_as_npy(tmp_path: Path, shape: tuple[int, ...]):
+    square = np.concatenate([matrices(), np.tile([[[0.0, 0, 0, 1]]], (COUNT, 1, 1))], axis=1)
+    np.save(
+        tmp_path / "poses.npy", (square if shape[-1] in (4, 16) and shape[1] != 3 else square[:, :3]).reshape(shape)
+    )
+    known = TrajectoryFormat(pose_times=tmp_path / "times.txt")
+    (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
+    trajectory, notes = read_trajectory(tmp_path / "poses.npy", known)
+    check(trajectory)
+    assert f"matrices, {COUNT} poses, times in us" in notes[0]
+    with pytest.raises(TrajectoryError, match="expected --pose-times with a line for each of its 12 poses"):
+        read_trajectory(tmp_path / "poses.npy")
+    np.save(tmp_path / "timed.npy", np.c_[T_US - T_US[0], square.reshape(COUNT, 16)])
+    check(read_trajectory(tmp_path / "timed.npy")[0], T_US - T_US[0])
+
+
+def test_arrays_that_are_no_matrices_are_named(tmp_path: Path):
+    square = np.concatenate([matrices(), np.tile([[[0.0, 0, 0, 1]]], (COUNT, 1, 1))], axis=1)
+    (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
+    known = TrajectoryFormat(pose_times=tmp_path / "times.txt")
+    lost = square.copy()
+    lost[4, 0, 3] = np.nan
+    for content, words in (
+        (square.transpose(0, 2, 1), "the last row of matrix 0 is"),
+        (2 * square[:, :3], "the matrix of pose 0 is no rotation"),
+        (lost, "pose 4: a number is not finite"),
+        (square[0], r"shape \(4, 4\), expected matrices \(poses, 4, 4\)"),
+        (square[:5], "12 times, expected one for each of the 5 poses"),
+    ):
+        np.save(tmp_path / "poses.npy", content)
+        with pytest.raises(TrajectoryError, match=words):
+            read_trajectory(tmp_path / "poses.npy", known)
+
+
+def test_numbers_of_frames_are_no_times_where_there_are_times(tmp_path: Path):
+    lines = "".join(f"{k} {' '.join(map(repr, m.ravel().tolist()))}\n" for k, m in enumerate(matrices()))
+    (tmp_path / "poses.txt").write_text(lines)
+    (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
+    check(read_trajectory(tmp_path / "poses.txt", TrajectoryFormat(pose_times=tmp_path / "times.txt"))[0])
