@@ -255,7 +255,7 @@ def _initial(path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None
 
 
 def _doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, offset_us: int) -> list[str]:
-    """What looks wrong of times in a unit that was guessed, beside the trajectory; an error where another looks right."""
+    """What looks wrong of times in a guessed unit, beside the trajectory; an error where another unit looks right."""
     unit = source.guessed_unit
     if unit is None or _beside(span_us, trajectory):
         return []

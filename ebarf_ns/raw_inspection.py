@@ -71,7 +71,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
     seconds = max((last_us - first_us) * 1e-6, 1e-6)
     busiest = np.argsort(counts.ravel())[::-1][:_HOTTEST].tolist()
     return RawSummary(
-        format=source.format,
+        format="; ".join([source.format, *source.notes]),
         events=events,
         width=said[0] if said else width,
         height=said[1] if said else height,

@@ -148,13 +148,17 @@ def guessed_unit(t: Num[np.ndarray, "events"]) -> TimeUnit:
 
 
 def coarseness(t: Num[np.ndarray, "events"], unit: TimeUnit) -> list[str]:
-    """What is lost of times whose type holds no microseconds that late."""
-    if t.dtype.kind != "f" or not len(t) or not np.isfinite(latest := np.abs(t).max()):
+    """What is lost of times whose type holds no microseconds that late; or of times that went through such a type."""
+    if t.dtype.kind != "f" or not len(t) or not np.isfinite(t).all():
         return []
+    was = "are"
+    if t.dtype == np.float64 and len(t) >= _FEW_ROWS and not is_whole(t) and np.abs(t).max() < _EXACT:
+        was, t = ("were", t.astype(np.float32)) if (t == t.astype(np.float32)).all() else (was, t)
+    latest = np.abs(t).max()
     step_us = float(np.spacing(latest)) * 10.0 ** DECIMALS[unit]
     if step_us <= 1:
         return []
-    return [f"times are {t.dtype}, which lie {step_us:.3g} us apart at {latest:.6g} {unit}: what is finer is lost"]
+    return [f"times {was} {t.dtype}, which lie {step_us:.3g} us apart at {latest:.6g} {unit}: what is finer is lost"]
 
 
 def telling(columns: Sequence[Any]) -> list[np.ndarray]:

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import ROLES, UNITS, guessed_unit, spaced, told_order
+from ebarf_ns.events.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
 from ebarf_ns.events.source import DECIMALS, Piece, Source, TimeUnit
 
 _BLOCK_BYTES = 1 << 22
@@ -80,8 +80,10 @@ def _layout(path: Path, time_unit: TimeUnit | None, columns: str | None) -> _Lay
             roles = tuple(ROLES.index(role) for role in order)
         column = roles.index(_TIME)
         times = [fields[column] for _, fields in lines[place:] if column < len(fields)]
-        unit = time_unit or unit
-        return _Layout(roles, unit or _guessed(times), unit is None, size, number - 1, order, notes)
+        stated, unit = time_unit or unit, time_unit or unit or _guessed(times)
+        numbers = [number for number in map(_decimal, times) if number is not None]
+        notes += tuple(coarseness(np.array(numbers, float), unit))
+        return _Layout(roles, unit, stated is None, size, number - 1, order, notes)
     raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
 
 
