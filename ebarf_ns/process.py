@@ -140,6 +140,10 @@ def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ing
     if layout:
         if not source.is_dir():
             raise SceneError(f"{source}: a file, expected the folder of a {layout} recording")
+        if settings.event_columns:
+            raise SceneError(
+                f"{source}: {layout} knows its columns, expected no --event-columns, or the recording's file"
+            )
         given = Given(settings.camera, settings.sensor_size, settings.part, settings.frames, settings.event_time_unit)
         return LAYOUTS[layout](source, given)
     known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]

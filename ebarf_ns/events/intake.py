@@ -42,6 +42,12 @@ class Intake:
     """Leave out pixels with more events than the median of the active ones plus this many median deviations."""
     refractory_us: int = 0
     """Leave out events that follow the last one kept of their pixel within less than this."""
+    flip_polarity: bool = False
+    """Take brighter for darker, for a source that has them the other way round."""
+    flip_x: bool = False
+    """Mirror columns, for events whose x counts from the right; frames and calibration stay as they are."""
+    flip_y: bool = False
+    """Mirror rows, for events whose y counts from below; frames and calibration stay as they are."""
     time_offset_us: int = 0
     """Added to every time."""
     start_us: int | None = None
@@ -85,7 +91,7 @@ def take_in(
     ``hot`` marks the pixels to leave out, see :func:`hot_pixels`. Raises :class:`RecordingError` naming file, place,
     value and expectation for whatever is not an event of a sensor of that size, in order.
     """
-    report = IntakeReport(source.format, notes=source.notes)
+    report = IntakeReport(source.format, notes=source.notes + _flips(intake))
     pieces = _checked(source, sensor_size, intake, report, progress)
     if intake.unsorted == "sort":
         pieces = _sorted(pieces, report)
@@ -93,6 +99,13 @@ def take_in(
     write_recording(output, _noted(kept, report), source.path)
     report.left_out += source.dropped
     return report
+
+
+def _flips(intake: Intake) -> tuple[str, ...]:
+    flipped = {"polarity": intake.flip_polarity, "x": intake.flip_x, "y": intake.flip_y}
+    return (
+        (f"flipped, as asked: {', '.join(name for name in flipped if flipped[name])}",) if any(flipped.values()) else ()
+    )
 
 
 def checked(source: Source, sensor_size: tuple[int, int]) -> Recording:
@@ -148,6 +161,9 @@ def _checked(
         progress(report.read)
         polarity = 2 * (piece.polarity > 0).view(np.int8) - 1
         x, y = (column.astype(np.uint16, copy=False) for column in (piece.x, piece.y))
+        polarity = -polarity if intake.flip_polarity else polarity
+        x = (width - 1 - x).astype(np.uint16) if intake.flip_x else x
+        y = (height - 1 - y).astype(np.uint16) if intake.flip_y else y
         t_us = t_us + intake.time_offset_us if intake.time_offset_us else t_us
         yield _windowed(Recording(x, y, t_us, polarity), intake, report)
 
