@@ -25,8 +25,8 @@ TELLING_ROWS = 1 << 16
 ROLES = "txyp"
 _NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps"),
-    "x": ("x", "xs", "x_pos", "x_coordinate", "x_coordinates", "col", "column"),
-    "y": ("y", "ys", "y_pos", "y_coordinate", "y_coordinates", "row"),
+    "x": ("x", "xs", "x_pos", "x_coordinate", "x_coordinates", "x_coord", "xpos", "x_addr", "col", "column"),
+    "y": ("y", "ys", "y_pos", "y_coordinate", "y_coordinates", "y_coord", "ypos", "y_addr", "row"),
     "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on", "sign"),
 }
 # The micro sign, and the Greek letter that looks like it.
@@ -103,6 +103,12 @@ def told_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usual: 
     if usual not in unsorted and len(unsorted) == 1:
         return unsorted[0], "told by their values, though times do decrease"
     return usual, "as is usual, though their values are not like that"
+
+
+def look_like_events(columns: Sequence[Num[np.ndarray, "events"]]) -> bool:
+    """Whether four columns are events in some order, where other arrays of such a shape are about."""
+    enough = len(columns[0]) >= _FEW_ROWS
+    return enough and any(_fit(columns, order) > 0 or _fits_unsorted(columns, order) for order in _orders())
 
 
 def _orders() -> list[str]:

@@ -206,3 +206,31 @@ def test_several_arrays_of_events_must_be_chosen_from(tmp_path: Path):
     with pytest.raises(RecordingError, match="2 places hold events .*--part"):
         open_recording(tmp_path / "a.h5")
     same(open_recording(tmp_path / "a.h5", part="right"))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5"])
+def test_fields_whose_names_say_nothing_are_told_by_their_values(tmp_path: Path, suffix: str):
+    array = np.zeros(400, [("f0", "<i2"), ("f1", "<i2"), ("f2", "<i8"), ("f3", "i1")])
+    for field, role in zip(array.dtype.names or (), "xytp", strict=True):
+        array[field] = events()[role]
+    source = open_recording(save(tmp_path / f"a{suffix}", array))
+    assert source.columns == "xytp"
+    same(source)
+
+
+def test_columns_without_names_and_matrices_of_poses(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", *(events()[role] for role in "pxyt"))
+    same(open_recording(tmp_path / "a.npz"))
+    others = {"K": np.eye(4), "pose": np.random.default_rng(0).normal(size=(30, 4)), "quaternions": np.zeros((4, 4))}
+    np.savez(tmp_path / "b.npz", events=table("xypt"), **others)
+    same(open_recording(tmp_path / "b.npz"))
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["raw"] = table("ptxy")
+        for name, matrix in others.items():
+            file[name] = matrix
+    same(open_recording(tmp_path / "c.h5"))
+    with h5py.File(tmp_path / "c.h5", "a") as file:
+        for role, column in events().items():
+            file[f"named/{role}"] = column
+    assert "events in /named," in open_recording(tmp_path / "c.h5").format
+    same(open_recording(tmp_path / "c.h5", part="raw"))

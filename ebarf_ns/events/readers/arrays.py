@@ -18,16 +18,18 @@ from scipy.io import loadmat
 
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.columns import (
+    ROLES,
     coarseness,
     guessed_unit,
     integers,
     is_whole,
+    look_like_events,
     named,
     spaced,
     telling,
     told_order,
     unit_of,
-)  # fmt: skip
+)
 from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 from ebarf_ns.files import opened_npz
 
@@ -143,11 +145,18 @@ def _found(path: Path, arrays: Arrays, part: str | None) -> _Found:
         arrays = {part: arrays[part]}
     if found := _by_names(path, arrays):
         return found
+    if found := _without_names(arrays):
+        return found
     candidates: dict[str, _Found] = {}
     for name in arrays:
         found = _in_one(path, arrays[name])
         if found:
             candidates[name] = found
+    if len(candidates) > 1:
+        # Matrices of poses and cameras have four columns as well.
+        candidates = {
+            name: found for name, found in candidates.items() if found.order or look_like_events(telling(found.columns))
+        } or candidates
     if len(candidates) != 1:
         raise RecordingError(_neither(path, arrays, list(candidates)))
     return next(iter(candidates.values()))
@@ -166,6 +175,18 @@ def _by_names(path: Path, arrays: Arrays) -> _Found | None:
     return _Found(columns, "ns" if robust else unit_of(names["t"]))
 
 
+def _without_names(arrays: Arrays) -> _Found | None:
+    """Four columns whose names say nothing, such as NumPy's own."""
+    if len(arrays) != len(ROLES):
+        return None
+    columns = tuple(arrays[name] for name in arrays)
+    if not all(isinstance(column, np.ndarray) and column.dtype.kind in "iubf" for column in columns):
+        return None
+    columns = tuple(map(_flat, columns))
+    alike = len({column.shape for column in columns}) == 1 and columns[0].ndim == 1
+    return _Found(columns, order=None) if alike else None
+
+
 def _of_position(path: Path, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if position.ndim != 2 or position.shape[1] != 2:
         raise RecordingError(f"{path}: position is of shape {position.shape}, expected (events, 2)")
@@ -182,7 +203,8 @@ def _in_one(path: Path, array: Any) -> _Found | None:
     if isinstance(array, Mapping):
         return _by_names(path, array)
     if array.dtype.names:
-        return _by_names(path, {name: _flat(array)[name] for name in array.dtype.names})
+        fields = {name: _flat(array)[name] for name in array.dtype.names}
+        return _by_names(path, fields) or _without_names(fields)
     if array.ndim != 2 or 4 not in array.shape or array.dtype.kind not in "iubf":
         return None
     return _Found(tuple(array.T if array.shape[1] == 4 else array), order=None)

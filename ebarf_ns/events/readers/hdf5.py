@@ -17,7 +17,18 @@ import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import coarseness, guessed_unit, integers, named, spaced, telling, told_order, unit_of
+from ebarf_ns.events.columns import (
+    ROLES,
+    coarseness,
+    guessed_unit,
+    integers,
+    look_like_events,
+    named,
+    spaced,
+    telling,
+    told_order,
+    unit_of,
+)
 from ebarf_ns.events.readers import ecf
 from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 
@@ -80,7 +91,7 @@ def read_hdf5(
     """
     try:
         with h5py.File(path, "r") as file:
-            name = _choose(path, _groups(file), group)
+            name = _choose(path, _groups(file, group), group)
             size = _sensor_size(file, name)
             events = _events_of(file[name] if name else file)  # pyright: ignore[reportArgumentType]
             assert events is not None
@@ -109,8 +120,9 @@ def _told(
     return order, unit, notes + coarseness(t, unit)
 
 
-def _groups(file: h5py.File) -> dict[str, _Events]:
-    """Where events are: groups with four columns, and compound tables with four fields; else rows of four numbers."""
+def _groups(file: h5py.File, wanted: str | None) -> dict[str, _Events]:
+    """Where events are: groups with four columns, and compound tables with four fields; rows of four numbers where
+    there are none of those, or one is wanted."""
     found: dict[str, _Events] = {}
 
     def look(name: str, thing: h5py.Group | h5py.Dataset) -> None:
@@ -120,7 +132,14 @@ def _groups(file: h5py.File) -> dict[str, _Events]:
 
     look("", file)
     file.visititems(look)
-    return {name: events for name, events in found.items() if events.order} or found
+    if wanted is not None:
+        return found
+    if by_name := {name: events for name, events in found.items() if events.order}:
+        return by_name
+    if len(found) < 2:
+        return found
+    # Matrices of poses and cameras have four columns as well.
+    return {name: events for name, events in found.items() if look_like_events(telling(events.columns))} or found
 
 
 def _events_of(thing: h5py.Group | h5py.Dataset) -> _Events | None:
@@ -132,6 +151,9 @@ def _events_of(thing: h5py.Group | h5py.Dataset) -> _Events | None:
     else:
         return _matrix(thing)
     names = named(columns)
+    numbers = all(column.dtype.kind in "iubf" for column in columns.values() if column)
+    if not names and numbers and isinstance(thing, h5py.Dataset) and len(columns) == len(ROLES):
+        return _Events(tuple(columns.values()), order=None)  # pyright: ignore[reportArgumentType]
     return _Events(tuple(columns[names[role]] for role in "xytp"), names["t"]) if names else None  # pyright: ignore[reportArgumentType]
 
 
