@@ -182,8 +182,11 @@ def _check_values(source: Source, piece: Piece, width: int, height: int) -> None
     # One look at the extremes, and only where they are wrong a look at each.
     if wide < width and high < height and int(x.min()) >= 0 and int(y.min()) >= 0 and _plausible(t_us):
         return
-    swapped = f"; x reaches {wide} and y {high}: are they swapped?" if wide < height and high < width else ""
-    swapped += _read_as(source)
+    swapped = _read_as(source)
+    if wide < height and high < width:
+        other = source.columns.translate(str.maketrans("xy", "yx"))
+        swapped = f"; x reaches {wide} and y {high}: are they swapped?"
+        swapped += f" --event-columns '{' '.join(other)}' says so" if other else ""
     for name, column, wrong, expected in (
         ("x", x, (x < 0) | (x >= width), f"0 to {width - 1}, the sensor width{swapped}"),
         ("y", y, (y < 0) | (y >= height), f"0 to {height - 1}, the sensor height{swapped}"),
@@ -200,9 +203,7 @@ def _check_values(source: Source, piece: Piece, width: int, height: int) -> None
 def _read_as(source: Source) -> str:
     """Of columns without names, how they were read, and what says otherwise."""
     return (
-        f"; columns have no names, and are read as '{' '.join(source.columns)}' (--event-columns)"
-        if source.columns
-        else ""
+        f"; columns are read as '{' '.join(source.columns)}', --event-columns says otherwise" if source.columns else ""
     )
 
 
