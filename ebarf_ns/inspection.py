@@ -148,6 +148,12 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     if summary.path_length == 0:
         found.append("the trajectory does not move: depth cannot be seen without translation")
     gaps_us = trajectory.t_us.diff()
+    if summary.end_us - summary.start_us < 0.5 * float(gaps_us.double().median()):
+        found.append(
+            f"the events last {(summary.end_us - summary.start_us) / 1000:.3f} ms, but keyframes are "
+            f"{float(gaps_us.double().median()) / 1000:.0f} ms apart: is their time in another unit? ebarf process has "
+            "--event-time-unit"
+        )
     if int(gaps_us.max()) > 5 * float(gaps_us.double().median()):
         found.append(f"the longest gap between keyframes is {int(gaps_us.max()) / 1000:.0f} ms, 5 times the median")
     found.extend(_between_two(summary, trajectory))

@@ -19,7 +19,7 @@ from ebarf_ns.errors import SceneError
 from ebarf_ns.events.readers.arrays import read_npy, read_npz
 from ebarf_ns.events.readers.hdf5 import read_hdf5
 from ebarf_ns.events.readers.text import read_text
-from ebarf_ns.events.source import Source
+from ebarf_ns.events.source import Source, TimeUnit
 from ebarf_ns.files import opened_npz
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
@@ -69,6 +69,8 @@ class Given:
     """Of two event cameras, which."""
     frames: bool = True
     """Whether pictures are looked for."""
+    event_time_unit: TimeUnit | None = None
+    """Of the events, where it is not the usual one."""
 
 
 NOTHING_GIVEN = Given()
@@ -85,7 +87,9 @@ def ecd(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     # The DAVIS' frames are linear up to its sensor's offset.
     listed = _listed(folder / "images.txt", "s") if given.frames else []
     frames = tuple(FrameFile(path, t_us, None, np.eye(4), "linear") for t_us, path in listed)
-    return Ingredients(lambda: read_text(folder / "events.txt", "s"), camera, groundtruth, frames, notes=notes)
+    return Ingredients(
+        lambda: read_text(folder / "events.txt", given.event_time_unit or "s"), camera, groundtruth, frames, notes=notes
+    )
 
 
 def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
@@ -122,7 +126,11 @@ def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
             for path, t_us in zip(images, times, strict=True)
         ]
     return Ingredients(
-        lambda: read_hdf5(events, "events"), event_camera.camera, groundtruth, tuple(frames), notes=notes
+        lambda: read_hdf5(events, "events", given.event_time_unit),
+        event_camera.camera,
+        groundtruth,
+        tuple(frames),
+        notes=notes,
     )
 
 
@@ -147,7 +155,13 @@ def eds(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
         ]
     elif stamped:
         notes.append("the frames are another camera's; without a --camera file that has both, they are left out")
-    return Ingredients(lambda: read_hdf5(folder / "events.h5"), None, groundtruth, tuple(frames), notes=notes)
+    return Ingredients(
+        lambda: read_hdf5(folder / "events.h5", None, given.event_time_unit),
+        None,
+        groundtruth,
+        tuple(frames),
+        notes=notes,
+    )
 
 
 def esim(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
@@ -157,7 +171,7 @@ def esim(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     if poses:
         groundtruth, notes = read_trajectory(poses, TrajectoryFormat("ns", "xyzw"))
     events = folder / "events" if (folder / "events").is_dir() else folder
-    return Ingredients(lambda: read_npy(events), None, groundtruth, notes=notes)
+    return Ingredients(lambda: read_npy(events, given.event_time_unit), None, groundtruth, notes=notes)
 
 
 def robust_e_nerf(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
@@ -167,7 +181,11 @@ def robust_e_nerf(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     threshold = _contrast_threshold(calibration) if calibration.is_file() else None
     groundtruth, notes = read_trajectory(folder / "camera_poses.npz")
     return Ingredients(
-        lambda: read_npz(folder / "raw_events.npz"), camera, groundtruth, contrast_threshold=threshold, notes=notes
+        lambda: read_npz(folder / "raw_events.npz", given.event_time_unit),
+        camera,
+        groundtruth,
+        contrast_threshold=threshold,
+        notes=notes,
     )
 
 

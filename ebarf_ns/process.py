@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from ebarf_ns.calibration import read_calibration
-from ebarf_ns.errors import SceneError, TrajectoryError
+from ebarf_ns.errors import RecordingError, SceneError, TrajectoryError
 from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.events.intake import Intake, hot_pixels, take_in
-from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised
-from ebarf_ns.events.source import Source, TimeUnit
+from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised, recognised_folder
+from ebarf_ns.events.source import DECIMALS, Source, TimeUnit
 from ebarf_ns.files import whole_folder
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
@@ -36,8 +36,23 @@ from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 _LONGEST_SPAN_RATIO = 100
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 Format = Literal[
-    "auto", "ecd", "tumvie", "eds", "esim", "robust-e-nerf", "hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "text"
+    "auto",
+    "ecd",
+    "tumvie",
+    "eds",
+    "esim",
+    "robust-e-nerf",
+    "hdf5",
+    "aedat4",
+    "bag",
+    "raw",
+    "dat",
+    "npz",
+    "npy",
+    "mat",
+    "text",
 ]
+_FEW_KEYFRAMES, _SHORT_SHARE, _MUCH_LONGER = 4, 0.5, 500
 
 
 @dataclass(frozen=True)
@@ -59,10 +74,13 @@ class ProcessSettings:
     contrast_threshold: tuple[float, float] | None = None
     """On and off, where known."""
     part: str | None = None
-    """The group of an HDF5 file or the topic of a bag that has the events, where several have; of TUM-VIE's event
-    cameras left or right."""
+    """The group of an HDF5 file, the topic of a bag or the array of an npz or mat file that has the events, where
+    several have; of TUM-VIE's event cameras left or right."""
     event_time_unit: TimeUnit | None = None
-    """Of the events in text, npz and HDF5 files, where they do not say so."""
+    """Of the events in text, HDF5, npz, npy and mat files, where they do not say so."""
+    event_columns: str | None = None
+    """Order of the columns of such files where they have no names, such as 'x y p t'; told by their values where not
+    given."""
     events: Intake = field(default_factory=Intake)
     """What to do with events."""
     bounds: Bounds | None = None
@@ -122,17 +140,36 @@ def _unpacked(source: Path) -> Iterator[Path]:
 def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
     if not source.exists():
         raise SceneError(f"{source}: no such file or folder, expected a recording")
-    if format in LAYOUTS or (format == "auto" and source.is_dir() and not (source / "metadata.yaml").is_file()):
-        layout: Layout = recognised_layout(source) if format == "auto" else format  # pyright: ignore[reportAssignmentType]
+    layout = _layout(format, source)
+    if layout:
         if not source.is_dir():
             raise SceneError(f"{source}: a file, expected the folder of a {layout} recording")
-        return LAYOUTS[layout](source, Given(settings.camera, settings.sensor_size, settings.part, settings.frames))
+        if settings.event_columns:
+            raise SceneError(
+                f"{source}: {layout} knows its columns, expected no --event-columns, or the recording's file"
+            )
+        given = Given(settings.camera, settings.sensor_size, settings.part, settings.frames, settings.event_time_unit)
+        return LAYOUTS[layout](source, given)
     known: RecordingFormat | None = format if format in get_args(RecordingFormat) else None  # pyright: ignore[reportAssignmentType]
     known = known or recognised(source)
-    opened = lambda: open_recording(source, known, settings.part, settings.event_time_unit)  # noqa: E731
+    opened = lambda: open_recording(source, known, settings.part, settings.event_time_unit, settings.event_columns)  # noqa: E731
     left_out: Counter[str] = Counter()
     frames = _frames_within(source, known, opened, settings.part, left_out) if settings.frames else ()
     return Ingredients(opened, frames=frames, frames_left_out=left_out)
+
+
+def _layout(format: Format, source: Path) -> Layout | None:
+    """The dataset that a folder is; none where it is a bag, or has but files of events."""
+    if format in LAYOUTS:
+        return format  # pyright: ignore[reportReturnType]
+    if format != "auto" or not source.is_dir() or (source / "metadata.yaml").is_file():
+        return None
+    try:
+        return recognised_layout(source)
+    except SceneError:
+        if recognised_folder(source):
+            return None
+        raise
 
 
 def _frames_within(
@@ -184,6 +221,7 @@ def _assemble(
         notes += said
     if initial is None:
         raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
+    notes += _doubts(source, span_us, initial, intake.time_offset_us)
     windowed = intake.start_us is not None or intake.end_us is not None
     notes += _apart(initial, span_us, settings.trajectory or source.path, windowed)
     initial = _clipped(initial, span_us, settings.trajectory or source.path)
@@ -244,6 +282,39 @@ def _initial(
     if groundtruth is None:
         return read_trajectory(path, known, span_us)
     return read_beside_reference(path, groundtruth, known, span_us)
+
+
+def _doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, offset_us: int) -> list[str]:
+    """What looks wrong of times in a guessed unit, beside the trajectory; an error where another unit looks right."""
+    unit = source.guessed_unit
+    if unit is None or _beside(span_us, trajectory):
+        return []
+    units: tuple[TimeUnit, ...] = ("s", "ms", "us", "ns")
+    others = []
+    for other in units:
+        factor = 10.0 ** (DECIMALS[other] - DECIMALS[unit])
+        scaled = tuple(round((t_us - offset_us) * factor) + offset_us for t_us in span_us)
+        if other != unit and _beside(scaled, trajectory):
+            others.append(f"{other} ({(scaled[1] - scaled[0]) * 1e-6:.3f} s)")
+    seconds, of_poses = (span_us[1] - span_us[0]) * 1e-6, int(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6
+    doubt = f"events over {seconds:.6f} s, if their times are in {unit}, beside a trajectory over {of_poses:.3f} s"
+    if others:
+        raise RecordingError(
+            f"{source.path}: {doubt}; expected --event-time-unit with {' or '.join(others)}, or {unit} if it is right"
+        )
+    return [f"suspicious: {doubt}; --event-time-unit says another unit"]
+
+
+def _beside(span_us: tuple[int, ...], trajectory: Trajectory) -> bool:
+    """Whether events and trajectory overlap, and neither is many hundred times as long as the other, nor the events
+    shorter than the time between keyframes."""
+    first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    if min(span_us[1], last_us) <= max(span_us[0], first_us):
+        return False
+    length_us = span_us[1] - span_us[0]
+    alike = last_us - first_us < _MUCH_LONGER * length_us and length_us < _MUCH_LONGER * (last_us - first_us)
+    short = length_us < _SHORT_SHARE * float(trajectory.t_us.diff().double().median())
+    return alike and not (short and len(trajectory.t_us) >= _FEW_KEYFRAMES)
 
 
 def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:

@@ -18,6 +18,7 @@ _LARGEST_SENSOR = 8192
 _SLOT_US = 100_000
 _HOTTEST, _HOT_DEVIATIONS = 5, 50
 _PICTURES, _PICTURE_US = 12, 20_000
+_SHORTEST_US, _FEW_A_MOMENT = 50_000, 2
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -49,7 +50,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
     source = open_events()
     counts = np.zeros((1, 1), np.int64)
     slots: dict[int, int] = {}
-    events = brighter = late = 0
+    events = brighter = late = moments = 0
     first_us, last_us, before_us = None, 0, None
     for piece in source.pieces:
         counts = _count(source.path, counts, piece)
@@ -57,6 +58,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
         for one, many in zip(slot.tolist(), number.tolist(), strict=True):
             slots[one] = slots.get(one, 0) + many
         late += int(np.count_nonzero(np.diff(piece.t_us, prepend=before_us or piece.t_us[0]) < 0))
+        moments += int(np.count_nonzero(np.diff(piece.t_us))) + (before_us != piece.t_us[0])
         before_us = int(piece.t_us[-1])
         first_us = int(piece.t_us.min()) if first_us is None else min(first_us, int(piece.t_us.min()))
         last_us = max(last_us, int(piece.t_us.max())) if events else int(piece.t_us.max())
@@ -69,7 +71,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
     seconds = max((last_us - first_us) * 1e-6, 1e-6)
     busiest = np.argsort(counts.ravel())[::-1][:_HOTTEST].tolist()
     return RawSummary(
-        format=source.format,
+        format="; ".join([source.format, *source.notes]),
         events=events,
         width=said[0] if said else width,
         height=said[1] if said else height,
@@ -81,7 +83,10 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
         brighter_share=brighter / events,
         hottest_pixels=[(k % width, k // width, int(counts.ravel()[k])) for k in busiest],
         rate=_rates(slots, first_us, last_us, parts),
-        suspicions=_suspicions(source, counts, brighter / events, late),
+        suspicions=[
+            *_suspicions(source, counts, brighter / events, late),
+            *_doubts(source, events, moments, last_us - first_us),
+        ],
     )
 
 
@@ -120,6 +125,16 @@ def _suspicions(source: Source, counts: np.ndarray, brighter: float, late: int) 
             f"{hot} pixels are more than {_HOT_DEVIATIONS} deviations busier than usual; ebarf process has --hot-pixels"
         )
     return found
+
+
+def _doubts(source: Source, events: int, moments: int, span_us: int) -> list[str]:
+    """Of times whose unit was guessed: milliseconds and numbers of frames are few and close together."""
+    if not source.guessed_unit or span_us >= _SHORTEST_US or events < _FEW_A_MOMENT * moments:
+        return []
+    return [
+        f"{moments:,} distinct times for {events:,} events, over {span_us / 1000:.3f} ms if they are in "
+        f"{source.guessed_unit}: are they numbers of frames, or in another unit? ebarf process has --event-time-unit"
+    ]
 
 
 def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,13 @@ from scipy.spatial.transform import Rotation
 from ebarf_ns.calibration import read_calibration, read_cameras
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError
 from ebarf_ns.events.intake import Intake
+from ebarf_ns.events.recognise import open_recording
 from ebarf_ns.events.recording import read_recording
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
 from ebarf_ns.inspection import inspect_scene
 from ebarf_ns.process import ProcessSettings, process
+from ebarf_ns.raw_inspection import inspect_recording
 from ebarf_ns.scene import read_scene
 from tests.conftest import DATA, REPOSITORY, run_command, run_ok
 from tests.events import writers
@@ -605,6 +608,73 @@ def test_real_calibrations_of_tum_vie(side: str):
     found = read_calibration(path, "2")
     assert (found.camera.width, found.camera.height) == (1280, 720) and 1000 < found.camera.fx < 1100
     assert found.rig_from_camera is not None and np.isclose(np.linalg.det(found.rig_from_camera), 1)
+
+
+def saved(tmp_path: Path, factor: float, dtype: type = int) -> tuple[Path, ProcessSettings]:
+    """Events of 2 s whose times are in another unit, and poses."""
+    (tmp_path / "t.txt").write_text(poses("s"))
+    np.savez(tmp_path / "a.npz", **columns() | {"t": (columns()["t"] * factor).astype(dtype)})  # pyright: ignore[reportArgumentType]
+    return tmp_path / "a.npz", ProcessSettings(trajectory=tmp_path / "t.txt", camera=calibration(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("factor", "dtype", "said", "unit"),
+    [(1e-3, int, "us", "ms"), (1e3, int, "us", "ns"), (1e-3, float, "us", "ms"), (1.0, float, "us", "us")],
+)
+def test_a_unit_that_was_guessed_is_checked_beside_the_trajectory(
+    tmp_path: Path, factor: float, dtype: type, said: str, unit: str
+):
+    path, settings = saved(tmp_path, factor, dtype)
+    if said != unit:
+        expected = rf"if their times are in {said}, beside .* expected --event-time-unit with {unit} \("
+        with pytest.raises(RecordingError, match=expected):
+            process("auto", path, tmp_path / "scene", settings)
+        assert not (tmp_path / "scene").exists()
+        settings = replace(settings, event_time_unit=unit)  # pyright: ignore[reportArgumentType]
+    sentences = process("auto", path, tmp_path / "scene", settings)
+    assert f"npz, times in {unit}: 2,000 events read, 2,000 kept, over 1.999 s" in sentences
+    assert not any("suspicious" in sentence for sentence in sentences)
+
+
+def test_a_unit_that_is_stated_is_taken_and_inspection_doubts_it(tmp_path: Path):
+    path, settings = saved(tmp_path, 1e-3)
+    process("auto", path, tmp_path / "scene", replace(settings, event_time_unit="us"))
+    (doubt,) = [one for one in inspect_scene(tmp_path / "scene").suspicions if "--event-time-unit" in one]
+    assert doubt.startswith("the events last 1.999 ms, but keyframes are 8 ms apart")
+
+
+def test_numbers_of_frames_are_suspicious_before_there_is_a_scene(tmp_path: Path):
+    path, _ = saved(tmp_path, 1e-4)
+    (doubt,) = [one for one in inspect_recording(lambda: open_recording(path)).suspicions if "--event-time-unit" in one]
+    assert doubt.startswith("200 distinct times for 2,000 events, over 0.199 ms if they are in us")
+
+
+def test_a_folder_of_npz_files_is_a_recording(tmp_path: Path):
+    folder = tmp_path / "pairs"
+    folder.mkdir()
+    for k in range(4):
+        some = {name: column[500 * k : 500 * k + 500] for name, column in columns().items()}
+        np.savez(folder / f"{k:06d}.npz", **some)  # pyright: ignore[reportArgumentType]
+    (tmp_path / "t.txt").write_text(poses("s"))
+    settings = ProcessSettings(trajectory=tmp_path / "t.txt", camera=calibration(tmp_path))
+    said = process("auto", folder, tmp_path / "scene", settings)
+    assert said[0] == "4 npz files, times in us: 2,000 events read, 2,000 kept, over 1.999 s"
+
+
+def test_flags_of_columns_and_flips(tmp_path: Path):
+    rows = np.stack([columns()[name] for name in "yxpt"], 1)
+    np.savetxt(tmp_path / "a.txt", rows, "%d")
+    (tmp_path / "t.txt").write_text(poses("s"))
+    out = run_command(
+        "ebarf", "process", "auto", tmp_path / "a.txt", "--output", tmp_path / "scene", "--camera",
+        calibration(tmp_path), "--trajectory", tmp_path / "t.txt", "--event-columns", "y x p t", "--flip-x",
+        "--flip-polarity",
+    )  # fmt: skip
+    assert out.code == 0 and "columns y x p t, as stated" in out.errors, out.errors
+    assert "flipped, as asked: polarity, x" in out.errors
+    recording, expected = read_recording(tmp_path / "scene" / "events.h5", 64, 48), writers.recording(EVENTS)
+    assert np.array_equal(recording.x, 63 - expected.x) and np.array_equal(recording.polarity, -expected.polarity)
+    assert np.array_equal(recording.y, expected.y)
 
 
 def test_a_raw_recording_is_inspected(tmp_path: Path):

@@ -42,6 +42,12 @@ class Intake:
     """Leave out pixels with more events than the median of the active ones plus this many median deviations."""
     refractory_us: int = 0
     """Leave out events that follow the last one kept of their pixel within less than this."""
+    flip_polarity: bool = False
+    """Take brighter for darker, for a source that has them the other way round."""
+    flip_x: bool = False
+    """Mirror columns, for events whose x counts from the right; frames and calibration stay as they are."""
+    flip_y: bool = False
+    """Mirror rows, for events whose y counts from below; frames and calibration stay as they are."""
     time_offset_us: int = 0
     """Added to every time."""
     start_us: int | None = None
@@ -61,11 +67,12 @@ class IntakeReport:
     last_us: int = 0
     left_out: Counter[str] = field(default_factory=Counter)
     repaired: Counter[str] = field(default_factory=Counter)
+    notes: tuple[str, ...] = ()
 
     def sentences(self) -> list[str]:
         """For people."""
         span_s = (self.last_us - self.first_us) * 1e-6
-        found = [f"{self.format}: {self.read:,} events read, {self.kept:,} kept, over {span_s:.3f} s"]
+        found = [f"{self.format}: {self.read:,} events read, {self.kept:,} kept, over {span_s:.3f} s", *self.notes]
         found += [f"left out: {count:,} {reason}" for reason, count in self.left_out.items() if count]
         found += [f"repaired: {count:,} {what}" for what, count in self.repaired.items() if count]
         return found
@@ -84,7 +91,7 @@ def take_in(
     ``hot`` marks the pixels to leave out, see :func:`hot_pixels`. Raises :class:`RecordingError` naming file, place,
     value and expectation for whatever is not an event of a sensor of that size, in order.
     """
-    report = IntakeReport(source.format)
+    report = IntakeReport(source.format, notes=source.notes + _flips(intake))
     pieces = _checked(source, sensor_size, intake, report, progress)
     if intake.unsorted == "sort":
         pieces = _sorted(pieces, report)
@@ -92,6 +99,13 @@ def take_in(
     write_recording(output, _noted(kept, report), source.path)
     report.left_out += source.dropped
     return report
+
+
+def _flips(intake: Intake) -> tuple[str, ...]:
+    flipped = {"polarity": intake.flip_polarity, "x": intake.flip_x, "y": intake.flip_y}
+    return (
+        (f"flipped, as asked: {', '.join(name for name in flipped if flipped[name])}",) if any(flipped.values()) else ()
+    )
 
 
 def checked(source: Source, sensor_size: tuple[int, int]) -> Recording:
@@ -135,9 +149,9 @@ def _checked(
     width, height = sensor_size
     turned_us, before_us, lowest, highest = 0, None, 1, 0
     for piece in source.pieces:
-        _check_values(source.path, piece, width, height)
+        _check_values(source, piece, width, height)
         lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
-        _check_polarity(source.path, piece, lowest, highest)
+        _check_polarity(source, piece, lowest, highest)
         t_us = piece.t_us + turned_us if turned_us else piece.t_us
         if _late(t_us, before_us).any():
             t_us, turned_us = _unwrapped(t_us.copy(), before_us, turned_us, report)
@@ -147,6 +161,9 @@ def _checked(
         progress(report.read)
         polarity = 2 * (piece.polarity > 0).view(np.int8) - 1
         x, y = (column.astype(np.uint16, copy=False) for column in (piece.x, piece.y))
+        polarity = -polarity if intake.flip_polarity else polarity
+        x = (width - 1 - x).astype(np.uint16) if intake.flip_x else x
+        y = (height - 1 - y).astype(np.uint16) if intake.flip_y else y
         t_us = t_us + intake.time_offset_us if intake.time_offset_us else t_us
         yield _windowed(Recording(x, y, t_us, polarity), intake, report)
 
@@ -159,13 +176,17 @@ def _late(t_us: Int64[np.ndarray, "events"], before_us: int | None) -> Bool[np.n
     return late
 
 
-def _check_values(path: Path, piece: Piece, width: int, height: int) -> None:
+def _check_values(source: Source, piece: Piece, width: int, height: int) -> None:
     x, y, t_us = piece.x, piece.y, piece.t_us
     wide, high = int(x.max()), int(y.max())
     # One look at the extremes, and only where they are wrong a look at each.
     if wide < width and high < height and int(x.min()) >= 0 and int(y.min()) >= 0 and _plausible(t_us):
         return
-    swapped = f"; x reaches {wide} and y {high}: are they swapped?" if wide < height and high < width else ""
+    swapped = _read_as(source)
+    if wide < height and high < width:
+        other = source.columns.translate(str.maketrans("xy", "yx"))
+        swapped = f"; x reaches {wide} and y {high}: are they swapped?"
+        swapped += f" --event-columns '{' '.join(other)}' says so" if other else ""
     for name, column, wrong, expected in (
         ("x", x, (x < 0) | (x >= width), f"0 to {width - 1}, the sensor width{swapped}"),
         ("y", y, (y < 0) | (y >= height), f"0 to {height - 1}, the sensor height{swapped}"),
@@ -174,16 +195,23 @@ def _check_values(path: Path, piece: Piece, width: int, height: int) -> None:
         if wrong.any():
             k = int(wrong.argmax())
             raise RecordingError(
-                f"{path}: {name} of {piece.place(k)} is {column[k]}, expected {expected} "
+                f"{source.path}: {name} of {piece.place(k)} is {column[k]}, expected {expected} "
                 f"({np.count_nonzero(wrong):,} such of the {len(piece):,} events around it)"
             )
+
+
+def _read_as(source: Source) -> str:
+    """Of columns without names, how they were read, and what says otherwise."""
+    return (
+        f"; columns are read as '{' '.join(source.columns)}', --event-columns says otherwise" if source.columns else ""
+    )
 
 
 def _plausible(t_us: np.ndarray) -> bool:
     return -_MAX_TIME_US <= int(t_us.min()) and int(t_us.max()) <= _MAX_TIME_US
 
 
-def _check_polarity(path: Path, piece: Piece, lowest: int, highest: int) -> None:
+def _check_polarity(source: Source, piece: Piece, lowest: int, highest: int) -> None:
     """Either 0 and 1 or -1 and 1, in the whole file."""
     signed = lowest < 0
     p = piece.polarity
@@ -191,8 +219,8 @@ def _check_polarity(path: Path, piece: Piece, lowest: int, highest: int) -> None
     if lowest < -1 or highest > 1 or (signed and wrong.any()):
         k = int(wrong.argmax()) if wrong.any() else 0
         raise RecordingError(
-            f"{path}: polarity of {piece.place(k)} is {p[k]}, expected 0 (darker) and 1 (brighter), or -1 and 1, "
-            f"throughout; the file has {lowest} to {highest}"
+            f"{source.path}: polarity of {piece.place(k)} is {p[k]}, expected 0 (darker) and 1 (brighter), or -1 and "
+            f"1, throughout; the file has {lowest} to {highest}{_read_as(source)}"
         )
 
 

@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.columns import parsed_order
 from ebarf_ns.events.readers.text import read_text
 from ebarf_ns.events.source import Source, TimeUnit
 
-RecordingFormat = Literal["hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "text"]
+RecordingFormat = Literal["hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "mat", "text"]
 _MAGIC: dict[bytes, RecordingFormat] = {
     b"\x89HDF\r\n\x1a\n": "hdf5", b"#!AER-DAT4.0": "aedat4", b"#ROSBAG V2.0": "bag", b"SQLite format 3": "bag",
     b"\x89MCAP0\r\n": "bag", b"PK\x03\x04": "npz", b"\x93NUMPY": "npy",
+    b"MATLAB 5.0 MAT-file": "mat", b"MATLAB 7.3 MAT-file": "hdf5",
 }  # fmt: skip
 _BEGINNING = 4096
 
@@ -22,17 +24,28 @@ def open_recording(
     known: RecordingFormat | None = None,
     part: str | None = None,
     time_unit: TimeUnit | None = None,
+    columns: str | None = None,
 ) -> Source:
-    """A recording of any format; ``part`` is the group of an HDF5 file or the topic of a bag, where there are several.
+    """A recording of any format; ``part`` is the group of an HDF5 file, the topic of a bag or the array of a file of
+    arrays, where there are several; ``columns`` is the order of columns without names, as in ``x y p t``.
 
     Raises :class:`RecordingError` where it cannot be opened or is none.
     """
-    found = known or recognised(path)
+    order = parsed_order(columns) if columns is not None else None
+    source = _opened(path, known or recognised(path), part, time_unit, order)
+    if order and not source.columns:
+        raise RecordingError(f"{path}: {source.format}, whose columns have names; expected no --event-columns")
+    return source
+
+
+def _opened(
+    path: Path, found: RecordingFormat, part: str | None, time_unit: TimeUnit | None, order: str | None
+) -> Source:
     # Some of the libraries take long to import, and each file needs one of them.
     if found == "hdf5":
         from ebarf_ns.events.readers.hdf5 import read_hdf5
 
-        return read_hdf5(path, part, time_unit)
+        return read_hdf5(path, part, time_unit, order)
     if found == "aedat4":
         from ebarf_ns.events.readers.aedat4 import read_aedat4
 
@@ -45,18 +58,21 @@ def open_recording(
         from ebarf_ns.events.readers.prophesee import read_dat, read_raw
 
         return read_raw(path) if found == "raw" else read_dat(path)
-    if found in ("npz", "npy"):
-        from ebarf_ns.events.readers.arrays import read_npy, read_npz
+    if found in ("npz", "npy", "mat"):
+        from ebarf_ns.events.readers.arrays import read_mat, read_npy, read_npz
 
-        return read_npz(path, time_unit) if found == "npz" else read_npy(path)
-    return read_text(path, time_unit)
+        if found == "npy":
+            return read_npy(path, time_unit, order)
+        return (read_npz if found == "npz" else read_mat)(path, time_unit, order, part)
+    return read_text(path, time_unit, order)
 
 
 def recognised_folder(path: Path) -> RecordingFormat | None:
     """The recording that a folder is, if it is one."""
     if (path / "metadata.yaml").is_file():
         return "bag"
-    return "npy" if any(path.glob("*.npy")) else None
+    kinds: tuple[RecordingFormat, ...] = ("npy", "npz")
+    return next((kind for kind in kinds if any(path.glob(f"*.{kind}"))), None)
 
 
 def recognised(path: Path) -> RecordingFormat:
@@ -64,7 +80,9 @@ def recognised(path: Path) -> RecordingFormat:
     if path.is_dir():
         if found := recognised_folder(path):
             return found
-        raise RecordingError(f"{path}: a folder without metadata.yaml (ROS 2) or .npy files, expected a recording")
+        raise RecordingError(
+            f"{path}: a folder without metadata.yaml (ROS 2), .npy or .npz files, expected a recording"
+        )
     try:
         with path.open("rb") as file:
             beginning = file.read(_BEGINNING)

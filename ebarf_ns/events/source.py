@@ -47,6 +47,12 @@ class Source:
     pieces: Iterator[Piece]
     dropped: Counter[str] = field(default_factory=Counter)
     """Events that the file hints at but does not hold in full, by reason; counted while reading."""
+    notes: tuple[str, ...] = ()
+    """What was found out of columns and times, for people."""
+    guessed_unit: TimeUnit | None = None
+    """Of the times, where nothing but their look says so."""
+    columns: str = ""
+    """Their order, a letter each, where they have no names."""
 
 
 def fits(t: Num[np.ndarray, "events"], unit: TimeUnit) -> Bool[np.ndarray, "events"]:

@@ -12,7 +12,7 @@ from ebarf_ns.events.recognise import RecordingFormat, open_recording
 from tests.conftest import DATA
 from tests.events.test_recognise import MADE, SINGLE, SIZE
 
-FORMATS: list[RecordingFormat] = ["hdf5", "aedat4", "bag", "raw", "dat", "npz", "text"]
+FORMATS: list[RecordingFormat] = ["hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "mat", "text"]
 EDIT = st.tuples(
     st.sampled_from(["flip", "remove", "insert", "repeat", "zero"]), st.floats(0, 1), st.binary(min_size=1, max_size=24)
 )

@@ -124,3 +124,15 @@ def test_the_clock_can_be_moved(tmp_path: Path):
 def test_nothing_left_is_an_error(tmp_path: Path):
     with pytest.raises(RecordingError, match="no event is left"):
         taken(tmp_path, [(10, 1, 1, 0), (20, 1, 1, 1)], start_us=100)
+
+
+def test_what_is_flipped_is_said_and_nothing_else_changes(tmp_path: Path):
+    events: list[writers.Event] = [(k, k % 24, k % 18, k % 3 % 2) for k in range(100)]
+    straight, report = taken(tmp_path, events)
+    assert not any("flipped" in sentence for sentence in report.sentences())
+    flipped, report = taken(tmp_path, events, flip_polarity=True, flip_x=True, flip_y=True)
+    assert "flipped, as asked: polarity, x, y" in report.sentences()
+    assert np.array_equal(flipped.polarity, -straight.polarity) and np.array_equal(flipped.t_us, straight.t_us)
+    assert np.array_equal(flipped.x, 23 - straight.x) and np.array_equal(flipped.y, 17 - straight.y)
+    (only_y, report) = taken(tmp_path, events, flip_y=True)
+    assert np.array_equal(only_y.x, straight.x) and "flipped, as asked: y" in report.sentences()

@@ -61,7 +61,7 @@ def test_events_without_a_time_are_counted_and_left_out():
     assert not len(decoder.feed(np.array([0x0005, 0x2801, 0x2802], "<u2").tobytes())[0]) and decoder.timeless == 2
 
 
-@pytest.mark.parametrize(("encoding", "word"), [("evt2", "<u4"), ("evt2.1", "<u8"), ("evt3", "<u2")])
+@pytest.mark.parametrize(("encoding", "word"), [("evt2", "<u4"), ("evt2.1", "<u8")])
 def test_a_word_of_no_known_kind_is_named(tmp_path: Path, encoding: str, word: str):
     bits = np.dtype(word).itemsize * 8
     content = np.array([0x8 << (bits - 4), 0xB << (bits - 4)], word)
@@ -70,6 +70,31 @@ def test_a_word_of_no_known_kind_is_named(tmp_path: Path, encoding: str, word: s
     path = writers.raw(tmp_path / "a.raw", encoding.removeprefix("evt"), content.tobytes())
     with pytest.raises(RecordingError, match="word 1 is 0xb"):
         list(read_raw(path).pieces)
+
+
+@pytest.mark.parametrize("kinds", [(0x9999,), (0x1000, 0x9001, 0xBFFF, 0xC123, 0xD777)])
+def test_reserved_words_of_evt3_are_counted_and_left_out(tmp_path: Path, kinds: tuple[int, ...]):
+    events = [(1000 * k, k % 640, k % 480, k % 2) for k in range(300)]
+    words = np.frombuffer(writers.evt3(events), "<u2")
+    places = np.linspace(1, len(words) - 1, 15).astype(int)
+    padded = np.insert(words, places, np.resize(np.array(kinds, np.uint16), 15))
+    source = read_raw(writers.raw(tmp_path / "a.raw", "3.0", padded.tobytes()))
+    assert np.concatenate([piece.t_us for piece in source.pieces]).tolist() == [t for t, *_ in events]
+    assert source.dropped["words of reserved kinds, as padding is"] == 15
+    # Much of one padding is padding still; much of everything is no EVT3.
+    padded = np.insert(words, np.repeat(places, 100), np.resize(np.array(kinds, np.uint16), 1500))
+    source = read_raw(writers.raw(tmp_path / "b.raw", "3.0", padded.tobytes()))
+    if len(kinds) == 1:
+        assert sum(map(len, source.pieces)) == 300
+    else:
+        with pytest.raises(RecordingError, match="no word of EVT3, and .*% are none .*expected the encoding of its"):
+            list(source.pieces)
+
+
+def test_random_words_are_no_evt3(tmp_path: Path):
+    content = np.random.default_rng(0).bytes(4000)
+    with pytest.raises(RecordingError, match="no word of EVT3"):
+        list(read_raw(writers.raw(tmp_path / "a.raw", "3.0", content)).pieces)
 
 
 def test_a_cut_word_is_counted(tmp_path: Path):

@@ -7,8 +7,10 @@ import h5py
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.io import savemat
 
 from ebarf_ns.benchmarks.recordings import aedat4
 from ebarf_ns.errors import RecordingError
@@ -74,6 +76,12 @@ def npy_file(path: Path) -> Path:
     return path
 
 
+def mat(path: Path) -> Path:
+    t, x, y, p = columns()
+    savemat(path, {"x": x, "y": y, "ts": t.astype(float), "pol": 2.0 * p - 1})
+    return path
+
+
 def text(path: Path) -> Path:
     path.write_text("".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for t, x, y, p in EVENTS))
     return path
@@ -118,9 +126,9 @@ def bag1(path: Path, events: list[writers.Event] = EVENTS, size: tuple[int, int]
     return path
 
 
-def bag2(path: Path) -> Path:
+def bag2(path: Path, plugin: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
     store = types(2)
-    with Writer2(path, version=9) as bag:
+    with Writer2(path, version=9, storage_plugin=plugin) as bag:
         connection = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
         for k, message in enumerate(messages(store, EVENTS, SIZE)):
             bag.write(connection, 10**9 + k, store.serialize_cdr(message, "dvs_msgs/msg/EventArray"))
@@ -143,6 +151,7 @@ MADE: dict[str, Callable[[Path], Path]] = {
     "raw_events.npz": robust,
     "npy": npy,
     "a.npy": lambda path: npy_file(path),
+    "a.mat": mat,
     "a.txt": text,
     "a.bag": bag1,
     "ros2": bag2,
@@ -236,6 +245,15 @@ def test_a_file_of_a_ros2_bag_is_as_good_as_its_folder_and_alone_says_what_it_la
     (folder / "metadata.yaml").unlink()
     with pytest.raises(RecordingError, match="no metadata.yaml beside it, expected a ROS 2 bag's folder"):
         open_recording(database)
+
+
+def test_a_file_of_mcap_is_read_alone(tmp_path: Path):
+    (file,) = bag2(tmp_path / "ros2", StoragePlugin.MCAP).glob("*.mcap")
+    alone = file.rename(tmp_path / "alone.mcap")
+    assert np.array_equal(checked(open_recording(alone), SIZE).t_us, writers.recording(EVENTS).t_us)
+    alone.write_bytes(alone.read_bytes()[:-100])
+    with pytest.raises(RecordingError, match="alone.mcap: not a whole bag"):
+        open_recording(alone)
 
 
 @pytest.mark.parametrize("known", ["npz", "npy"])

@@ -1,91 +1,268 @@
-"""NumPy's files: ``.npz`` with a column each, as Robust e-NeRF and EventNeRF have them, and ESIM's ``.npy`` rows."""
+"""Arrays in files of NumPy (``.npz``, ``.npy``) and MATLAB (``.mat``), or in folders of such files.
+
+A file has a column each for x, y, time and polarity, as Robust e-NeRF and EventNeRF have them, a structured array with
+fields of such names, as Metavision, tonic and expelliarmus have them, or rows of four numbers, as ESIM has them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.io import loadmat
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.columns import (
+    ROLES,
+    coarseness,
+    guessed_unit,
+    integers,
+    is_whole,
+    look_like_events,
+    named,
+    spaced,
+    telling,
+    told_order,
+    unit_of,
+)
 from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 from ebarf_ns.files import opened_npz
 
 _EVENTS_AT_ONCE = 1 << 20
-_EXACT = 2.0**53  # floats beyond are no exact integers
-_NAMES = {
-    "x": ("x", "xs"), "y": ("y", "ys"), "t": ("t", "ts", "timestamp", "timestamps", "t_us", "t_ns"),
-    "p": ("p", "ps", "pol", "polarity"),
-}  # fmt: skip
+_ESIM = "xytp"
+Arrays = Mapping[str, Any]
+"""Those of a file, and structs of them, by name."""
 
 
-def read_npz(path: Path, time_unit: TimeUnit | None = None) -> Source:
-    """Columns x, y (or ``position``, a row each), t and p; raises :class:`RecordingError`.
+@dataclass(frozen=True)
+class _Found:
+    """The four columns of a file; without names, in the order that they have there."""
 
-    Times are nanoseconds in Robust e-NeRF's files (which have ``position``) and under the name ``t_ns``, seconds where
-    they are floats, and else microseconds, unless ``time_unit`` says otherwise.
+    columns: tuple[np.ndarray, ...]
+    unit: TimeUnit | None = None
+    """Where a name says so."""
+    order: str | None = "xytp"
+    """None: not known yet."""
+
+    def by_role(self, order: str) -> tuple[np.ndarray, ...]:
+        """x, y, t and p, where columns without names have this order."""
+        order = self.order or order
+        return tuple(self.columns[order.index(role)] for role in "xytp")
+
+
+def read_npz(
+    path: Path, time_unit: TimeUnit | None = None, columns: str | None = None, part: str | None = None
+) -> Source:
+    """One file, or a folder's, by name; raises :class:`RecordingError`.
+
+    Times are nanoseconds in Robust e-NeRF's files (which have ``position``), what their name says, as in ``t_ns``,
+    microseconds where they are whole numbers and else seconds, unless ``time_unit`` says otherwise. ``columns`` is the
+    order of columns without names, ``part`` the array that has them, where there are several.
     """
-    try:
-        with opened_npz(path) as file:
-            chosen = {role: next((name for name in names if name in file), None) for role, names in _NAMES.items()}
-            robust = "position" in file
-            if not (chosen["t"] and chosen["p"] and (robust or (chosen["x"] and chosen["y"]))):
-                names = ", ".join(file) or "none"
-                raise RecordingError(f"{path}: arrays {names}, expected x, y (or position), t and p")
-            t, p = file[chosen["t"]], file[chosen["p"]]
-            x, y = _columns(path, file["position"]) if robust else (file[chosen["x"]], file[chosen["y"]])
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: {error}") from None
-    unit = time_unit or ("ns" if robust or chosen["t"] == "t_ns" else "s" if t.dtype.kind == "f" else "us")
-    return Source(path, f"npz, times in {unit}", None, _pieces(path, (x, y, t, p), unit))
+    return _read(path, "npz", _npz, time_unit, columns, part)
 
 
-def _columns(path: Path, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_npy(path: Path, time_unit: TimeUnit | None = None, columns: str | None = None) -> Source:
+    """ESIM's and E-NeRF's ``*.npy`` files, by name, or one; as :func:`read_npz`, but for rows of ESIM's order.
+
+    Those have floats of nanoseconds.
+    """
+    return _read(path, "npy", _npy, time_unit, columns, None)
+
+
+def read_mat(
+    path: Path, time_unit: TimeUnit | None = None, columns: str | None = None, part: str | None = None
+) -> Source:
+    """Variables x, y, ts and pol of a MATLAB 5 file, or of a struct in it; as :func:`read_npz`."""
+    return _read(path, "mat", _mat, time_unit, columns, part)
+
+
+def _read(
+    path: Path,
+    kind: str,
+    arrays_of: Callable[[Path], AbstractContextManager[Arrays]],
+    time_unit: TimeUnit | None,
+    columns: str | None,
+    part: str | None,
+) -> Source:
+    files = sorted(path.glob(f"*.{kind}"), key=_by_number) if path.is_dir() else [path]
+    if not files:
+        raise RecordingError(f"{path}: holds no .{kind} file, expected events in files by time")
+
+    def open_one(file: Path) -> _Found:
+        with arrays_of(file) as arrays:
+            return _found(file, arrays, part)
+
+    # What lies in memory already is not read again.
+    first = _first_with_events(files, open_one)
+    last = _first_with_events(files[::-1], open_one) if len(files) > 1 else first
+    opened = open_one if len(files) > 1 else lambda file: first
+    ends = (first, last) if len(files) > 1 else (first,)
+    samples = [np.concatenate(parts) for parts in zip(*(telling(end.columns) for end in ends), strict=True)]
+    order, notes = "", []
+    if first.order is None:
+        order, how = (columns, "as stated") if columns else told_order(path, samples, _ESIM)
+        notes.append(f"columns {spaced(order)}, {how}")
+    t = replace(first, columns=tuple(samples)).by_role(order)[2]
+    unit = time_unit or first.unit or ("ns" if kind == "npy" and order == _ESIM and _of_esim(t) else guessed_unit(t))
+    notes += coarseness(t, unit)
+    name = f"{kind if len(files) == 1 else f'{len(files)} {kind} files'}, times in {unit}"
+    guess = None if time_unit or first.unit else unit
+    return Source(
+        path, name, None, _pieces(files, opened, order, unit), notes=tuple(notes), guessed_unit=guess, columns=order
+    )
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """So that 10 comes after 9 where names have no leading zeros."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part) if part.isdigit() else -1, part) for part in parts]
+
+
+def _first_with_events(files: list[Path], opened: Callable[[Path], _Found]) -> _Found:
+    """The first file that is not empty, or the last one."""
+    for file in files:
+        found = opened(file)
+        if len(found.columns[0]):
+            return found
+    return found
+
+
+def _of_esim(t: np.ndarray) -> bool:
+    return t.dtype.kind == "f" and is_whole(t)
+
+
+def _found(path: Path, arrays: Arrays, part: str | None) -> _Found:
+    """Where the events are among the arrays of a file."""
+    if part is not None:
+        if part not in arrays:
+            raise RecordingError(f"{path}: has no array {part}, expected one of {', '.join(arrays) or 'none'}")
+        arrays = {part: arrays[part]}
+    if found := _by_names(path, arrays):
+        return found
+    if found := _without_names(arrays):
+        return found
+    candidates: dict[str, _Found] = {}
+    for name in arrays:
+        found = _in_one(path, arrays[name])
+        if found:
+            candidates[name] = found
+    if len(candidates) > 1:
+        # Matrices of poses and cameras have four columns as well.
+        candidates = {
+            name: found for name, found in candidates.items() if found.order or look_like_events(telling(found.columns))
+        } or candidates
+    if len(candidates) != 1:
+        raise RecordingError(_neither(path, arrays, list(candidates)))
+    return next(iter(candidates.values()))
+
+
+def _by_names(path: Path, arrays: Arrays) -> _Found | None:
+    robust = "position" in arrays
+    names = named([*arrays, "x", "y"] if robust else arrays)
+    if names is None:
+        return None
+    x, y = _of_position(path, arrays["position"]) if robust else (arrays[names["x"]], arrays[names["y"]])
+    columns = tuple(_flat(np.asarray(column)) for column in (x, y, arrays[names["t"]], arrays[names["p"]]))
+    lengths = [column.shape for column in columns]
+    if len({*lengths}) != 1 or columns[0].ndim != 1:
+        raise RecordingError(f"{path}: columns of shapes {lengths}, expected one row per event")
+    return _Found(columns, "ns" if robust else unit_of(names["t"]))
+
+
+def _without_names(arrays: Arrays) -> _Found | None:
+    """Four columns whose names say nothing, such as NumPy's own."""
+    if len(arrays) != len(ROLES):
+        return None
+    columns = tuple(arrays[name] for name in arrays)
+    if not all(isinstance(column, np.ndarray) and column.dtype.kind in "iubf" for column in columns):
+        return None
+    columns = tuple(map(_flat, columns))
+    alike = len({column.shape for column in columns}) == 1 and columns[0].ndim == 1
+    return _Found(columns, order=None) if alike else None
+
+
+def _of_position(path: Path, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if position.ndim != 2 or position.shape[1] != 2:
         raise RecordingError(f"{path}: position is of shape {position.shape}, expected (events, 2)")
     return position[:, 0], position[:, 1]
 
 
-def read_npy(path: Path) -> Source:
-    """ESIM's and E-NeRF's ``*.npy`` files, by name, or one: rows (x, y, t in nanoseconds, polarity)."""
-    files = sorted(path.glob("*.npy")) if path.is_dir() else [path]
-    if not files:
-        raise RecordingError(f"{path}: holds no .npy file, expected rows of events in files by time")
-    return Source(path, f"{len(files)} npy files, times in ns", None, _rows(files))
+def _flat(column: np.ndarray) -> np.ndarray:
+    """MATLAB has but matrices, of which one side is 1."""
+    return column.reshape(-1) if column.ndim == 2 and 1 in column.shape else column
 
 
-def _rows(files: list[Path]) -> Iterator[Piece]:
+def _in_one(path: Path, array: Any) -> _Found | None:
+    """The events of a struct, a structured array, or rows (or columns) of four numbers."""
+    if isinstance(array, Mapping):
+        return _by_names(path, array)
+    if array.dtype.names:
+        fields = {name: _flat(array)[name] for name in array.dtype.names}
+        return _by_names(path, fields) or _without_names(fields)
+    if array.ndim != 2 or 4 not in array.shape or array.dtype.kind not in "iubf":
+        return None
+    return _Found(tuple(array.T if array.shape[1] == 4 else array), order=None)
+
+
+def _neither(path: Path, arrays: Arrays, candidates: list[str]) -> str:
+    if candidates:
+        return f"{path}: arrays {', '.join(candidates)} all look like events, expected one, or --part to choose"
+    listed = ", ".join(f"{name} {getattr(arrays[name], 'shape', '')}".strip() for name in arrays) or "none"
+    return f"{path}: arrays {listed:.200}, expected x, y (or position), t and p, or one of shape (events, 4)"
+
+
+@contextmanager
+def _npz(path: Path) -> Iterator[Arrays]:
+    try:
+        with opened_npz(path) as file:
+            yield file
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}") from None
+
+
+@contextmanager
+def _npy(path: Path) -> Iterator[Arrays]:
+    try:
+        array = np.load(path, mmap_mode="r")
+    except Exception as error:
+        # NumPy reads the header as Python: what a damaged one makes it raise has no common kind.
+        raise RecordingError(f"{path}: not a whole npy file of a plain array ({error})") from None
+    if not isinstance(array, np.ndarray):
+        raise RecordingError(f"{path}: not an npy file, expected rows of x, y, t and polarity")
+    yield {"array": array}
+
+
+@contextmanager
+def _mat(path: Path) -> Iterator[Arrays]:
+    try:
+        variables = loadmat(path)
+        arrays = {name: _unwrapped(value) for name, value in variables.items() if not name.startswith("__")}
+    except Exception as error:
+        # What a damaged file makes the library raise has no common kind.
+        raise RecordingError(f"{path}: not a whole MATLAB 5 file ({type(error).__name__}: {error})") from None
+    yield arrays
+
+
+def _unwrapped(value: Any) -> Any:
+    """A struct of arrays as a mapping."""
+    if getattr(value, "dtype", None) is not None and value.dtype.names and value.size == 1:
+        return {name: value[name].item() for name in value.dtype.names}
+    return np.asarray(value)
+
+
+def _pieces(files: list[Path], opened: Callable[[Path], _Found], order: str, unit: TimeUnit) -> Iterator[Piece]:
     for path in files:
-        try:
-            rows = np.load(path, mmap_mode="r")
-        except Exception as error:
-            # NumPy reads the header as Python: what a damaged one makes it raise has no common kind.
-            raise RecordingError(f"{path}: not a whole npy file of a plain array ({error})") from None
-        shape = getattr(rows, "shape", "none")
-        if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 4:
-            raise RecordingError(f"{path}: an array of shape {shape}, expected rows of x, y, t and polarity")
-        yield from _pieces(path, tuple(rows.T), "ns")
-
-
-def _pieces(path: Path, columns: tuple[np.ndarray, ...], unit: TimeUnit) -> Iterator[Piece]:
-    lengths = [column.shape for column in columns]
-    if len({*lengths}) != 1 or columns[0].ndim != 1:
-        raise RecordingError(f"{path}: columns of shapes {lengths}, expected one row per event")
-    for first in range(0, len(columns[0]), _EVENTS_AT_ONCE):
-        x, y, t, p = (column[first : first + _EVENTS_AT_ONCE] for column in columns)
-        x, y, p = (_integers(path, column, name, first) for name, column in (("x", x), ("y", y), ("p", p)))
-        yield Piece(x, y, _microseconds(path, t, unit, first), p, numbered(first, f"{path.name} row"))
-
-
-def _integers(path: Path, column: np.ndarray, name: str, first: int) -> np.ndarray:
-    """As integers, which floats may be too, as in ESIM's rows."""
-    if column.dtype.kind in "iub":
-        return column.astype(np.uint8) if column.dtype == bool else np.asarray(column)
-    whole = (np.abs(column) < _EXACT) & (column == np.rint(column)) if column.dtype.kind == "f" else np.zeros(1, bool)
-    if not whole.all():
-        row = int(whole.argmin())
-        raise RecordingError(f"{path}: {name} of row {first + row:,} is {column[row]!r:.30}, expected an integer")
-    return column.astype(np.int64)
+        columns = opened(path).by_role(order)
+        for first in range(0, len(columns[0]), _EVENTS_AT_ONCE):
+            x, y, t, p = (column[first : first + _EVENTS_AT_ONCE] for column in columns)
+            x, y, p = (integers(path, column, name, first) for name, column in (("x", x), ("y", y), ("p", p)))
+            yield Piece(x, y, _microseconds(path, t, unit, first), p, numbered(first, f"{path.name} row"))
 
 
 def _microseconds(path: Path, t: np.ndarray, unit: TimeUnit, first: int) -> np.ndarray:

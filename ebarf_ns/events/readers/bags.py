@@ -19,7 +19,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.readers.prophesee import TIMELESS, Decoder
+from ebarf_ns.events.readers.prophesee import Decoder, note_dropped
 from ebarf_ns.events.source import Piece, Source
 
 _ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -77,10 +77,14 @@ def _of_events(path: Path, bag: AnyReader, topic: str | None) -> list[Any]:
 def _opened(path: Path) -> Iterator[AnyReader]:
     """The bag; whatever a damaged one makes the library do, for it promises no kind of exception, is one line."""
     if path.is_file() and path.suffix != ".bag":
-        # A ROS 2 bag is a folder, and one of ROS 1 is known by its suffix.
-        if not (path.parent / "metadata.yaml").is_file():
-            raise RecordingError(f"{path}: no metadata.yaml beside it, expected a ROS 2 bag's folder or a .bag file")
-        path = path.parent
+        # A ROS 2 bag is a folder, and one of ROS 1 is known by its suffix. MCAP's files describe themselves.
+        if (path.parent / "metadata.yaml").is_file():
+            path = path.parent
+        elif path.suffix != ".mcap":
+            raise RecordingError(
+                f"{path}: no metadata.yaml beside it, expected a ROS 2 bag's folder ('ros2 bag reindex FOLDER' makes "
+                "metadata.yaml), an .mcap or a .bag file"
+            )
     try:
         with AnyReader([path]) as bag:
             yield bag
@@ -105,7 +109,7 @@ def _pieces(path: Path, topic: str | None, dropped: Counter[str]) -> Iterator[Pi
                 if packet.encoding == "evt3":
                     decoder = decoder or Decoder("evt3")
                     piece = _evt3(path, number, decoder, packet)
-                    dropped[TIMELESS] = decoder.timeless
+                    note_dropped(decoder, dropped)
                 elif packet.encoding == "mono":
                     piece = _mono(packet, place)
                 else:

@@ -1,13 +1,15 @@
-"""HDF5 recordings of any layout: a group with a column each for x, y, time and polarity, or one compound table.
+"""HDF5 recordings of any layout: a group with a column each for x, y, time and polarity, or one table.
 
 TUM-VIE and DSEC have ``/events/{x,y,t,p}`` and ``/t_offset``, EDS the columns at top level, M3ED
-``/prophesee/left/{x,y,t,p}``, Prophesee a table ``/CD/events``.
+``/prophesee/left/{x,y,t,p}``, Prophesee a compound table ``/CD/events``, v2e rows of four numbers
+``/events``. MATLAB 7.3's files are HDF5 as well, with columns that lie across.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,77 +17,177 @@ import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.columns import (
+    ROLES,
+    coarseness,
+    guessed_unit,
+    integers,
+    look_like_events,
+    named,
+    spaced,
+    telling,
+    told_order,
+    unit_of,
+)
 from ebarf_ns.events.readers import ecf
 from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 
 with suppress(ImportError):
     import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5
 
-_NAMES = {
-    "x": ("x", "xs", "x_pos"), "y": ("y", "ys", "y_pos"), "t": ("t", "ts", "timestamp", "timestamps", "time"),
-    "p": ("p", "ps", "pol", "polarity", "polarities", "on"),
-}  # fmt: skip
 _EVENTS_AT_ONCE = 1 << 20
 # What the library raises for one damage or another.
 _DAMAGES = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
-Columns = dict[str, h5py.Dataset | tuple[h5py.Dataset, str]]
+_USUAL = "txyp"
 
 
-def read_hdf5(path: Path, group: str | None = None, time_unit: TimeUnit | None = None) -> Source:
+@dataclass(frozen=True)
+class _Column:
+    """A dataset of one dimension, or a part of one."""
+
+    data: h5py.Dataset
+    field: str | None = None
+    """Of a compound table."""
+    index: int | None = None
+    """Of a matrix: which of its columns; which of its rows, where it lies across."""
+    across: bool = False
+
+    def __len__(self) -> int:
+        return self.data.shape[1] if self.across else self.data.shape[0]
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        if self.field is not None:
+            return self.data[self.field, rows]
+        if self.index is None:
+            return self.data[rows]
+        return self.data[self.index, rows] if self.across else self.data[rows, self.index]
+
+    @property
+    def dtype(self) -> np.dtype:
+        return self.data.dtype if self.field is None else self.data.dtype[self.field]
+
+
+@dataclass(frozen=True)
+class _Events:
+    """Where the events are."""
+
+    columns: tuple[_Column, ...]
+    time_name: str = ""
+    order: str | None = "xytp"
+    """None: not known yet."""
+
+    def by_role(self, order: str) -> dict[str, _Column]:
+        return dict(zip(self.order or order, self.columns, strict=True))
+
+
+def read_hdf5(
+    path: Path, group: str | None = None, time_unit: TimeUnit | None = None, columns: str | None = None
+) -> Source:
     """The events of ``group``, or of the only group that has any; raises :class:`RecordingError`.
 
-    Times are microseconds where they are integers and seconds where they are floats, unless ``time_unit`` says
-    otherwise; ``t_offset`` and Prophesee's compressed tables are in microseconds.
+    Times are in the unit that their name says, as in ``t_ns``, else microseconds where they are whole numbers and
+    seconds where they are not, unless ``time_unit`` says otherwise; ``t_offset`` and Prophesee's compressed tables are
+    in microseconds. ``columns`` is the order of columns without names.
     """
     try:
         with h5py.File(path, "r") as file:
-            name = _choose(path, _groups(file), group)
+            name = _choose(path, _groups(file, group), group)
             size = _sensor_size(file, name)
+            events = _events_of(file[name] if name else file)  # pyright: ignore[reportArgumentType]
+            assert events is not None
+            order, unit, notes = _told(path, name, events, time_unit, columns)
     except _DAMAGES as error:
         raise RecordingError(f"{path}: not a whole HDF5 file ({_one_line(error)})") from None
-    return Source(path, f"HDF5, events in /{name}", size, _pieces(path, name, time_unit))
+    guess = None if time_unit or unit_of(events.time_name) else unit
+    said = f"HDF5, events in /{name}, times in {unit}"
+    return Source(
+        path, said, size, _pieces(path, name, order, unit), notes=tuple(notes), guessed_unit=guess, columns=order
+    )
 
 
-def _groups(file: h5py.File) -> dict[str, Columns]:
-    """Where events are: groups with four columns, and compound tables with four fields."""
-    found: dict[str, Columns] = {}
+def _told(
+    path: Path, name: str, events: _Events, time_unit: TimeUnit | None, columns: str | None
+) -> tuple[str, TimeUnit, list[str]]:
+    """The order of columns without names, the unit of the times, and what tells them."""
+    order, notes = "", []
+    if events.order is None:
+        order, how = (columns, "as stated") if columns else told_order(path, telling(events.columns), _USUAL)
+        notes.append(f"columns {spaced(order)}, {how}")
+    _check(path, name, events.by_role(order))
+    time = events.by_role(order)["t"]
+    t = telling([time])[0] if time.dtype.kind == "f" else np.zeros(0, np.int64)
+    unit = time_unit or unit_of(events.time_name) or guessed_unit(t)
+    return order, unit, notes + coarseness(t, unit)
+
+
+def _groups(file: h5py.File, wanted: str | None) -> dict[str, _Events]:
+    """Where events are: groups with four columns, and compound tables with four fields; rows of four numbers where
+    there are none of those, or one is wanted."""
+    found: dict[str, _Events] = {}
 
     def look(name: str, thing: h5py.Group | h5py.Dataset) -> None:
-        columns = _columns_of(thing)
-        if columns:
-            found[name] = columns
+        events = _events_of(thing)
+        if events:
+            found[name] = events
 
     look("", file)
     file.visititems(look)
-    return found
+    if wanted is not None:
+        return found
+    if by_name := {name: events for name, events in found.items() if events.order}:
+        return by_name
+    if len(found) < 2:
+        return found
+    # Matrices of poses and cameras have four columns as well.
+    return {name: events for name, events in found.items() if look_like_events(telling(events.columns))} or found
 
 
-def _columns_of(thing: h5py.Group | h5py.Dataset) -> Columns | None:
+def _events_of(thing: h5py.Group | h5py.Dataset) -> _Events | None:
     if isinstance(thing, h5py.Group):
-        fields = [name for name, inner in thing.items() if isinstance(inner, h5py.Dataset) and inner.ndim == 1]
+        columns = {name: _column(inner) for name, inner in thing.items() if isinstance(inner, h5py.Dataset)}
+        columns = {name: column for name, column in columns.items() if column}
+    elif thing.dtype.names:
+        columns = {name: _Column(thing, name) for name in thing.dtype.names} if thing.ndim == 1 else {}
     else:
-        fields = list(thing.dtype.names or ()) if thing.ndim == 1 else []
-    chosen = {role: next((name for name in names if name in fields), None) for role, names in _NAMES.items()}
-    if None in chosen.values():
+        return _matrix(thing)
+    names = named(columns)
+    numbers = all(column.dtype.kind in "iubf" for column in columns.values() if column)
+    if not names and numbers and isinstance(thing, h5py.Dataset) and len(columns) == len(ROLES):
+        return _Events(tuple(columns.values()), order=None)  # pyright: ignore[reportArgumentType]
+    return _Events(tuple(columns[names[role]] for role in "xytp"), names["t"]) if names else None  # pyright: ignore[reportArgumentType]
+
+
+def _column(data: h5py.Dataset) -> _Column | None:
+    if data.ndim == 2 and 1 in data.shape:
+        across = data.shape[0] == 1
+        return _Column(data, index=0, across=across)
+    return _Column(data) if data.ndim == 1 else None
+
+
+def _matrix(data: h5py.Dataset) -> _Events | None:
+    """Rows of four numbers, or four rows of them."""
+    if data.ndim != 2 or 4 not in data.shape or data.dtype.kind not in "iubf":
         return None
-    return {role: thing[name] if isinstance(thing, h5py.Group) else (thing, name) for role, name in chosen.items()}  # pyright: ignore[reportReturnType]
+    across = data.shape[1] != 4
+    return _Events(tuple(_Column(data, index=k, across=across) for k in range(4)), order=None)
 
 
-def _choose(path: Path, groups: dict[str, Columns], wanted: str | None) -> str:
+def _choose(path: Path, groups: dict[str, _Events], wanted: str | None) -> str:
     if wanted is not None:
         if (name := wanted.strip("/")) not in groups:
             raise RecordingError(f"{path}: /{name} holds no events, expected one of {_listed(groups)}")
         return name
     if len(groups) != 1:
         raise RecordingError(
-            f"{path}: {len(groups)} groups hold events ({_listed(groups)}), expected one, or --part to choose"
+            f"{path}: {len(groups)} places hold events ({_listed(groups)}), expected one, or --part to choose"
             if groups
-            else f"{path}: no group has columns x, y, t and p of one dimension; expected the events in one"
+            else f"{path}: no group has columns x, y, t and p of one dimension, and no dataset is of shape "
+            "(events, 4); expected the events in one"
         )
     return next(iter(groups))
 
 
-def _listed(groups: dict[str, Columns]) -> str:
+def _listed(groups: dict[str, _Events]) -> str:
     return ", ".join(f"/{name}" for name in groups) or "none"
 
 
@@ -102,20 +204,20 @@ def _sensor_size(file: h5py.File, name: str) -> tuple[int, int] | None:
     return None
 
 
-def _pieces(path: Path, group: str, time_unit: TimeUnit | None) -> Iterator[Piece]:
+def _pieces(path: Path, group: str, order: str, unit: TimeUnit) -> Iterator[Piece]:
     try:
         with h5py.File(path, "r") as file:
-            columns = _columns_of(file[group] if group else file)  # pyright: ignore[reportArgumentType]
-            assert columns is not None
-            _check(path, group, columns)
+            events = _events_of(file[group] if group else file)  # pyright: ignore[reportArgumentType]
+            assert events is not None
+            columns = events.by_role(order)
             offset_us = int(np.asarray(file["t_offset"]).item()) if "t_offset" in file else 0
-            count = len(_dataset(columns["t"]))
-            if _is_ecf(_dataset(columns["t"])):
-                yield from _ecf_pieces(_dataset(columns["t"]), offset_us)
+            if _is_ecf(columns["t"].data):
+                yield from _ecf_pieces(columns["t"].data, offset_us)
                 return
-            for first in range(0, count, _EVENTS_AT_ONCE):
-                x, y, t, p = (_slice(columns[role], first) for role in "xytp")
-                t_us = _microseconds(path, group, t, first, time_unit)
+            for first in range(0, len(columns["t"]), _EVENTS_AT_ONCE):
+                x, y, t, p = (columns[role][first : first + _EVENTS_AT_ONCE] for role in "xytp")
+                x, y, p = (integers(path, column, name, first) for name, column in (("x", x), ("y", y), ("p", p)))
+                t_us = _microseconds(path, group, t, first, unit)
                 yield Piece(x, y, t_us + offset_us if offset_us else t_us, p, numbered(first, "row"))
     except _DAMAGES as error:
         raise RecordingError(f"{path}: /{group} cannot be read ({_one_line(error)})") from None
@@ -149,28 +251,18 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _dataset(column: h5py.Dataset | tuple[h5py.Dataset, str]) -> h5py.Dataset:
-    return column[0] if isinstance(column, tuple) else column
-
-
-def _slice(column: h5py.Dataset | tuple[h5py.Dataset, str], first: int) -> np.ndarray:
-    rows = slice(first, first + _EVENTS_AT_ONCE)
-    values = column[0][column[1], rows] if isinstance(column, tuple) else column[rows]
-    return values.astype(np.uint8) if values.dtype == bool else values
-
-
-def _check(path: Path, group: str, columns: Columns) -> None:
-    lengths = {role: len(_dataset(column)) for role, column in columns.items()}
+def _check(path: Path, group: str, columns: dict[str, _Column]) -> None:
+    lengths = {role: len(column) for role, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise RecordingError(f"{path}: columns of /{group} differ in length, {lengths}; expected one row per event")
     for role, column in columns.items():
-        dtype = column[0].dtype[column[1]] if isinstance(column, tuple) else column.dtype
-        if dtype.kind not in "iub" and not (role == "t" and dtype == np.float64):
-            raise RecordingError(f"{path}: /{group} has {role} of type {dtype}, expected integers (t: or float64)")
+        if column.dtype.kind not in "iubf":
+            raise RecordingError(
+                f"{path}: /{group} has {role} of type {column.dtype}, expected integers (t: or floats)"
+            )
 
 
-def _microseconds(path: Path, group: str, t: np.ndarray, first: int, time_unit: TimeUnit | None) -> np.ndarray:
-    unit = time_unit or ("s" if t.dtype.kind == "f" else "us")
+def _microseconds(path: Path, group: str, t: np.ndarray, first: int, unit: TimeUnit) -> np.ndarray:
     # Integers of microseconds always do.
     if (t.dtype.kind == "f" or unit != "us") and not (possible := fits(t, unit)).all():
         row = int(possible.argmin())

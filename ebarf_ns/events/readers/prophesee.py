@@ -26,6 +26,10 @@ _BYTES_AT_ONCE = 1 << 20
 _LONGEST_HEADER = 1 << 16
 TIMELESS = "events before the first time word, whose time is unknown"
 """Why some events of a stream are left out."""
+RESERVED = "words of reserved kinds, as padding is"
+"""Why some words of a stream are left out."""
+_RESERVED_KINDS = np.isin(np.arange(16), (0x1, 0x9, 0xB, 0xC, 0xD))
+_MANY_RESERVED, _PADDINGS = 0.1, 4
 # What a decoder remembers from word to word.
 _TIME_HIGH, _TIME_LOW, _EPOCH, _Y, _X_BASE, _POLARITY, _TIMELESS_EVENTS, _STATE = range(8)
 _UNKNOWN = -1
@@ -43,12 +47,18 @@ class Decoder:
         self._state = np.full(_STATE, _UNKNOWN, np.int64)
         self._state[[_EPOCH, _TIMELESS_EVENTS]] = 0
         self._rest = b""
+        self._reserved: Counter[int] = Counter()
         self.words = 0
 
     @property
     def timeless(self) -> int:
         """Number of events so far that came before any time."""
         return int(self._state[_TIMELESS_EVENTS])
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What was left out so far, by reason."""
+        return {TIMELESS: self.timeless, RESERVED: self._reserved.total()}
 
     @property
     def cut_bytes(self) -> int:
@@ -58,13 +68,16 @@ class Decoder:
     def feed(self, content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """x, y, t_us and polarity (0, 1) of the events in some more bytes.
 
-        Raises :class:`ValueError` with the number of the word for one of a kind that the encoding does not have.
+        Raises :class:`ValueError` with the number of the word for one of a kind that the encoding does not have. EVT3's
+        reserved kinds, which some cameras pad with, are left out, unless they are many and all different.
         """
         word = np.dtype(_WORD[self.encoding])
         content = self._rest + content
         whole = len(content) // word.itemsize * word.itemsize
         self._rest = content[whole:]
         words = np.frombuffer(content[:whole], word)
+        if self.encoding == "evt3":
+            self._check_reserved(words)
         if self.swapped_halves:
             words = (words << np.uint64(32)) | (words >> np.uint64(32))
         most = len(words) * _EVENTS_A_WORD[self.encoding]
@@ -80,6 +93,20 @@ class Decoder:
         self.words += len(words)
         x, y, t_us, polarity = (column[:count].copy() for column in columns)
         return x, y, t_us, polarity
+
+    def _check_reserved(self, words: np.ndarray) -> None:
+        """Count words of reserved kinds; what is no EVT3 has many, of all values, where padding has few or one."""
+        reserved = _RESERVED_KINDS[words >> 12]
+        if not reserved.any():
+            return
+        values, counts = np.unique(words[reserved], return_counts=True)
+        self._reserved.update(dict(zip(values.tolist(), counts.tolist(), strict=True)))
+        share = self._reserved.total() / (self.words + len(words))
+        if share > _MANY_RESERVED and len(self._reserved) > _PADDINGS:
+            first = int(reserved.argmax())
+            raise ValueError(
+                f"word {self.words + first:,} is {int(words[first]):#x}, no word of EVT3, and {share:.0%} are none"
+            )
 
 
 def read_raw(path: Path) -> Source:
@@ -104,12 +131,18 @@ def _raw_pieces(path: Path, begin: int, decoder: Decoder, dropped: Counter[str])
                 raise RecordingError(
                     f"{path}: {error} (words begin at byte {begin:,}); expected the encoding of its header"
                 ) from None
-            dropped[TIMELESS] = decoder.timeless
+            note_dropped(decoder, dropped)
             if len(columns[0]):
                 yield Piece(*columns, numbered(events))
                 events += len(columns[0])
     if decoder.cut_bytes:
         dropped["words cut short by the end of the file"] += 1
+
+
+def note_dropped(decoder: Decoder, dropped: Counter[str]) -> None:
+    """Set what a decoder has left out so far."""
+    for reason, count in decoder.dropped.items():
+        dropped[reason] = count
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
@@ -228,8 +261,7 @@ def _decode_evt3(words, state, x, y, t_us, polarity):
                 # The low half that belongs to it comes next.
                 state[_TIME_LOW] = 0
             _advance(state, payload, 12, 24)
-        elif kind not in (0x7, 0xA, 0xE, 0xF):
-            return count, i
+    # The other kinds are of the outside, go on with what they follow, or are reserved.
     return count, -1
 
 

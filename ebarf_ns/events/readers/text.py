@@ -1,11 +1,13 @@
 """Events as text, a line each: exact decimal times, every malformed line named.
 
-``t x y p`` in any order that a line of names above them gives, separated by blanks, commas or semicolons; a first line
-``width height`` is rpg_e2vid's. Numbers may have points and exponents, as ``numpy.savetxt`` writes them.
+``t x y p`` in any order that a line of names above them gives or their values tell, separated by blanks, commas or
+semicolons; a first line ``width height`` is rpg_e2vid's. Numbers may have points and exponents, as ``numpy.savetxt``
+writes them.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
@@ -16,18 +18,15 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
 from ebarf_ns.events.source import DECIMALS, Piece, Source, TimeUnit
 
 _BLOCK_BYTES = 1 << 22
 _TIME, _X, _Y, _POLARITY, _LINE, _TABLE = range(6)
 _ROLES = {
-    "t": _TIME, "ts": _TIME, "time": _TIME, "timestamp": _TIME, "timestamps": _TIME, "x": _X, "y": _Y, "p": _POLARITY,
-    "pol": _POLARITY, "polarity": _POLARITY, "on": _POLARITY,
-}  # fmt: skip
-# The micro sign, and the Greek letter that looks like it.
-_UNITS: dict[str, TimeUnit] = {
-    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "milliseconds": "ms", "us": "us",
-    "\u00b5s": "us", "\u03bcs": "us", "usec": "us", "microseconds": "us", "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
+    "t": _TIME, "ts": _TIME, "time": _TIME, "times": _TIME, "timestamp": _TIME, "timestamps": _TIME, "x": _X, "xs": _X,
+    "y": _Y, "ys": _Y, "p": _POLARITY, "ps": _POLARITY, "pol": _POLARITY, "polarity": _POLARITY,
+    "polarities": _POLARITY, "on": _POLARITY,
 }  # fmt: skip
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _SIGNIFICANT = 18  # digits that fit int64
@@ -42,37 +41,68 @@ class _Layout(NamedTuple):
     """Whether nothing but the look of the first times says so."""
     sensor_size: tuple[int, int] | None
     header_lines: int
+    order: str
+    """A letter each, where they have no names."""
+    notes: tuple[str, ...]
 
 
-def read_text(path: Path, time_unit: TimeUnit | None = None) -> Source:
-    """Times are seconds where one of the first has a point, else microseconds, unless their name or ``time_unit`` says
-    otherwise.
+def read_text(path: Path, time_unit: TimeUnit | None = None, columns: str | None = None) -> Source:
+    """Columns are in the order of their names, of ``columns``, or that their values tell; usually ``t x y p``.
 
+    Times are seconds where one of the first has a point or an exponent, but where all of these are whole numbers; else
+    microseconds. Their name or ``time_unit`` says otherwise.
     Raises :class:`RecordingError` with file, line, text and expectation; nothing is repaired or dropped.
     """
-    layout = _layout(path, time_unit)
+    layout = _layout(path, time_unit, columns)
     name = f"text, times in {layout.unit}"
-    return Source(path, name, layout.sensor_size, _pieces(path, layout))
+    guess = layout.unit if layout.guessed else None
+    return Source(
+        path, name, layout.sensor_size, _pieces(path, layout), notes=layout.notes, guessed_unit=guess,
+        columns=layout.order,
+    )  # fmt: skip
 
 
-def _layout(path: Path, time_unit: TimeUnit | None) -> _Layout:
+def _layout(path: Path, time_unit: TimeUnit | None, columns: str | None) -> _Layout:
     """What the first lines say about the others."""
-    size, roles, unit = None, (_TIME, _X, _Y, _POLARITY), None
+    size, roles, unit = None, None, None
     lines = list(_first_lines(path))
     for place, (number, fields) in enumerate(lines):
         numeric = [_decimal(field) for field in fields]
-        if None in numeric and roles == (_TIME, _X, _Y, _POLARITY) and unit is None:
+        if None in numeric and roles is None:
             roles, unit = _named_columns(path, number, fields, time_unit)
             continue
         if len(fields) == 2 and size is None and None not in numeric:
             size = int(numeric[0] or 0), int(numeric[1] or 0)
             continue
+        order, notes = "", ()
+        if roles is None:
+            order, notes = _told(path, [fields for _, fields in lines[place:]], columns)
+            roles = tuple(ROLES.index(role) for role in order)
         column = roles.index(_TIME)
         times = [fields[column] for _, fields in lines[place:] if column < len(fields)]
-        found: TimeUnit = "s" if any(re.search("[.eE]", time) for time in times) else "us"
-        unit = time_unit or unit
-        return _Layout(roles, unit or found, unit is None, size, number - 1)
+        stated, unit = time_unit or unit, time_unit or unit or _guessed(times)
+        numbers = [number for number in map(_decimal, times) if number is not None]
+        notes += tuple(coarseness(np.array(numbers, float), unit))
+        return _Layout(roles, unit, stated is None, size, number - 1, order, notes)
     raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
+
+
+def _told(path: Path, rows: list[list[str]], columns: str | None) -> tuple[str, tuple[str, ...]]:
+    """The order of columns without names, and what tells it."""
+    if columns:
+        return columns, (f"columns {spaced(columns)}, as stated",)
+    numbers = [[_decimal(field) for field in fields] for fields in rows]
+    whole = list(itertools.takewhile(lambda row: len(row) == len(ROLES) and None not in row, numbers))
+    order, how = told_order(path, list(np.array(whole, float).reshape(-1, len(ROLES)).T), ROLES)
+    return order, (f"columns {spaced(order)}, {how}",)
+
+
+def _guessed(times: list[str]) -> TimeUnit:
+    """By the first times: see :func:`read_text`."""
+    numbers = [_decimal(time) for time in times]
+    if not any(re.search("[.eE]", time) for time in times):
+        return "us"
+    return guessed_unit(np.array(numbers, float)) if None not in numbers else "s"
 
 
 def _first_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -93,9 +123,10 @@ def _first_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _decimal(text: str) -> Decimal | None:
     try:
-        return Decimal(text)
+        number = Decimal(text)
     except InvalidOperation:
         return None
+    return number if number.is_finite() else None
 
 
 def _named_columns(
@@ -107,9 +138,9 @@ def _named_columns(
         name, _, of = field.lower().strip("\"'").replace("[", "_").rstrip("])").replace("(", "_").partition("_")
         role = _ROLES.get(name, _UNUSED)
         if role == _TIME and time_unit is None:
-            unit = _UNITS.get(of)
+            unit = UNITS.get(of)
             if unit is None and re.search(r"[\[(].*\w", field):
-                expected = f"one of {', '.join(_UNITS)}, or --event-time-unit"
+                expected = f"one of {', '.join(UNITS)}, or --event-time-unit"
                 raise RecordingError(f"{path}:{number}: times in {of!r:.20}, expected {expected}")
         roles.append(role)
     if sorted(role for role in roles if role != _UNUSED) != [_TIME, _X, _Y, _POLARITY]:
@@ -129,6 +160,7 @@ def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
             columns = {_TIME: f"t[{layout.unit}]", _X: "x", _Y: "y", _POLARITY: "p", _UNUSED: "-"}
             names = " ".join(columns[role] for role in layout.roles)
             hint = ", or --event-time-unit" if exact else ""
+            hint += ", or --event-columns" if layout.order else ""
             raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'{hint}")
         if len(table):
             t_us, x, y, polarity, lines = table.T

@@ -1,0 +1,236 @@
+"""Files whose columns or times do not say what they are: values tell, or a flag is asked for."""
+
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.columns import guessed_unit, named, unit_of
+from ebarf_ns.events.intake import Intake, checked, take_in
+from ebarf_ns.events.recognise import open_recording
+from ebarf_ns.events.source import Source
+
+SIZE = (64, 48)
+ORDERS = ["".join(order) for order in permutations("txyp") if order.index("x") < order.index("y")]
+FIELDS = ["t x y p", "x y timestamp polarity", "X Y TS POL", "t_us x_pos y_pos on", "p t y x"]
+
+
+def events(count: int = 400) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(1)
+    t = np.cumsum(random.integers(0, 400, count)) + 7
+    return {
+        "t": t,
+        "x": random.integers(0, SIZE[0], count),
+        "y": random.integers(0, SIZE[1], count),
+        "p": random.integers(0, 2, count),
+    }
+
+
+def table(order: str, dtype: Any = np.int64, **changed: np.ndarray) -> np.ndarray:
+    columns = events() | changed
+    return np.stack([columns[role] for role in order], 1).astype(dtype)
+
+
+def structured(fields: str) -> np.ndarray:
+    array = np.zeros(400, [(name, "<i8" if name.lower()[0] == "t" else "<i2") for name in fields.split()])
+    for name in fields.split():
+        array[name] = events()[{"o": "p"}.get(name[0].lower(), name[0].lower())]
+    return array
+
+
+def save(path: Path, array: np.ndarray) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, array)
+    elif path.suffix == ".npz":
+        np.savez(path, recording=array, size=np.array(SIZE))
+    elif path.suffix == ".mat":
+        savemat(path, {"recording": array})
+    elif path.suffix == ".txt":
+        np.savetxt(path, array, "%d", delimiter="\t")
+    else:
+        with h5py.File(path, "w") as file:
+            file["data/raw"], file["other"] = array, np.zeros((7, 3))
+    return path
+
+
+def same(source: Source, step_us: float = 0.5) -> None:
+    back, expected = checked(source, SIZE), events()
+    assert np.abs(back.t_us - expected["t"]).max() <= step_us
+    assert np.array_equal(back.x, expected["x"]) and np.array_equal(back.y, expected["y"])
+    assert np.array_equal(back.polarity, 2 * expected["p"] - 1)
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".npy", ".npz", ".mat", ".h5"])
+@pytest.mark.parametrize("order", ORDERS)
+def test_rows_of_four_numbers_in_any_order(tmp_path: Path, suffix: str, order: str):
+    source = open_recording(save(tmp_path / f"a{suffix}", table(order)))
+    assert source.columns == order and f"columns {' '.join(order)}, " in source.notes[0]
+    assert source.guessed_unit == "us"
+    same(source)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".mat", ".h5"])
+@pytest.mark.parametrize("dtype", [np.uint32, np.float64])
+def test_rows_of_four_numbers_of_any_type_and_across(tmp_path: Path, suffix: str, dtype: Any):
+    rows = table("typx"[::-1], dtype) if suffix == ".h5" else table("xypt", dtype)
+    with_x_first = table("xypt", dtype)
+    same(open_recording(save(tmp_path / f"a{suffix}", with_x_first)))
+    same(open_recording(save(tmp_path / f"b{suffix}", np.ascontiguousarray(with_x_first.T))))
+    with pytest.raises(RecordingError):
+        checked(open_recording(save(tmp_path / f"c{suffix}", rows[:, :3])), SIZE)
+
+
+def test_signed_polarities_and_unsorted_times_tell_as_well(tmp_path: Path):
+    changed = {"p": 2 * events()["p"] - 1}
+    same(open_recording(save(tmp_path / "a.txt", table("xypt", **changed))))
+    t = events()["t"] + 10**6
+    t[[3, 9]] = t[[9, 3]]
+    source = open_recording(save(tmp_path / "b.txt", table("xypt", t=t)))
+    assert source.columns == "xypt" and "though times do decrease" in source.notes[0]
+    with pytest.raises(RecordingError, match="--unsorted sort"):
+        checked(source, SIZE)
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".npy", ".h5"])
+def test_where_two_orders_fit_a_flag_is_asked_for(tmp_path: Path, suffix: str):
+    path = save(tmp_path / f"a{suffix}", table("txyp", t=3 * np.arange(400), x=np.arange(400) // 7))
+    with pytest.raises(RecordingError, match="read as 't x y p' and as 'x t y p', expected --event-columns") as caught:
+        open_recording(path)
+    assert str(path) in str(caught.value)
+    assert open_recording(path, columns="t x y p").columns == "txyp"
+
+
+def test_a_stated_order_is_taken_and_checked(tmp_path: Path):
+    path = save(tmp_path / "a.txt", table("tyxp"))
+    with pytest.raises(RecordingError, match="are they swapped. --event-columns 't y x p' says so"):
+        checked(open_recording(path), SIZE)
+    same(open_recording(path, columns="t, y, x, p"))
+    with pytest.raises(RecordingError, match="--event-columns is 'xy', expected t, x, y and p once each"):
+        open_recording(path, columns="xy")
+    np.savez(tmp_path / "a.npz", **events())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(RecordingError, match="columns have names; expected no --event-columns"):
+        open_recording(tmp_path / "a.npz", columns="xypt")
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".mat", ".h5"])
+@pytest.mark.parametrize("fields", FIELDS)
+def test_structured_arrays_by_the_names_of_their_fields(tmp_path: Path, suffix: str, fields: str):
+    array = structured(fields)
+    if suffix == ".mat":
+        savemat(tmp_path / "a.mat", {"TD": {name: array[name] for name in array.dtype.names or ()}})
+        source = open_recording(tmp_path / "a.mat")
+    else:
+        source = open_recording(save(tmp_path / f"a{suffix}", array))
+    assert source.guessed_unit == (None if "t_us" in fields else "us")
+    same(source)
+
+
+def test_names_of_columns():
+    assert named(["polarity", "Y", "x_pos", "timestamp"]) == dict(t="timestamp", x="x_pos", y="Y", p="polarity")
+    assert named(["x", "y", "t"]) is None
+    assert unit_of("timestamp_ns") == "ns" and unit_of("t [ms]") == "ms" and unit_of("ts") is None
+    assert guessed_unit(np.array([0.0, 5.0])) == "us" and guessed_unit(np.array([0.0, 0.5])) == "s"
+    assert guessed_unit(np.array([0.0, 0.0])) == "s"
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5", "structured", "table", "mat", "txt", "double"])
+def test_times_of_single_precision_are_said_to_be_coarse(tmp_path: Path, kind: str):
+    late_s = 1504
+    columns = events() | {"t": (late_s + events()["t"] * 1e-6).astype(np.float32)}
+    path = tmp_path / ("a.npy" if kind in ("structured", "table", "double") else f"a.{kind}")
+    if kind == "npz":
+        np.savez(path, **columns)  # pyright: ignore[reportArgumentType]
+    elif kind == "mat":
+        savemat(path, columns)
+    elif kind == "h5":
+        with h5py.File(path, "w") as file:
+            for name, column in columns.items():
+                file[f"events/{name}"] = column
+    elif kind == "txt":
+        np.savetxt(path, np.stack(list(columns.values()), 1))
+    elif kind in ("table", "double"):
+        np.save(path, np.stack(list(columns.values()), 1).astype(np.float32 if kind == "table" else np.float64))
+    else:
+        array = np.zeros(400, [("t", "<f4"), ("x", "<i2"), ("y", "<i2"), ("p", "i1")])
+        for name, column in columns.items():
+            array[name] = column
+        np.save(path, array)
+    source = open_recording(path)
+    report = take_in(source, SIZE, Intake(), tmp_path / "out.h5")
+    was = "were" if kind in ("txt", "double") else "are"
+    assert any(f"times {was} float32, which lie 122 us apart at 1504." in line for line in report.sentences())
+
+
+def test_a_folder_of_npz_is_read_by_the_numbers_of_its_files(tmp_path: Path):
+    folder = tmp_path / "events"
+    folder.mkdir()
+    columns = events()
+    np.savez(folder / "0.npz", **{name: column[:0] for name, column in columns.items()})  # pyright: ignore[reportArgumentType]
+    for k in range(11):
+        some = {name: column[40 * k : 40 * k + 40 if k < 10 else 400] for name, column in columns.items()}
+        np.savez(folder / f"{k + 1}.npz", **some)  # pyright: ignore[reportArgumentType]
+    source = open_recording(folder)
+    assert source.format == "12 npz files, times in us"
+    same(source)
+    np.savez(folder / "13.npz", picture=np.zeros((3, 3)))
+    with pytest.raises(RecordingError, match=r"13.npz: arrays picture \(3, 3\), expected x, y"):
+        open_recording(folder)
+
+
+def test_matlab_files_of_either_kind(tmp_path: Path):
+    t, x, y, p = (events()[role] for role in "txyp")
+    savemat(tmp_path / "a.mat", {"x": x.astype(float), "y": y[:, None], "ts": t.astype(float), "pol": 2 * p - 1})
+    same(open_recording(tmp_path / "a.mat"))
+    with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
+        for name, column in {"x": x, "y": y, "ts": t, "pol": p}.items():
+            file[name] = column[None].astype(float)
+    content = (tmp_path / "b.mat").read_bytes()
+    (tmp_path / "b.mat").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + content[512:])
+    same(open_recording(tmp_path / "b.mat"))
+
+
+def test_several_arrays_of_events_must_be_chosen_from(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", left=table("txyp"), right=table("xytp"))
+    with pytest.raises(RecordingError, match="arrays left, right all look like events, expected one, or --part"):
+        open_recording(tmp_path / "a.npz")
+    same(open_recording(tmp_path / "a.npz", part="right"))
+    with pytest.raises(RecordingError, match="has no array up, expected one of left, right"):
+        open_recording(tmp_path / "a.npz", part="up")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["left"], file["right"] = table("txyp"), table("xytp")
+    with pytest.raises(RecordingError, match="2 places hold events .*--part"):
+        open_recording(tmp_path / "a.h5")
+    same(open_recording(tmp_path / "a.h5", part="right"))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5"])
+def test_fields_whose_names_say_nothing_are_told_by_their_values(tmp_path: Path, suffix: str):
+    array = np.zeros(400, [("f0", "<i2"), ("f1", "<i2"), ("f2", "<i8"), ("f3", "i1")])
+    for field, role in zip(array.dtype.names or (), "xytp", strict=True):
+        array[field] = events()[role]
+    source = open_recording(save(tmp_path / f"a{suffix}", array))
+    assert source.columns == "xytp"
+    same(source)
+
+
+def test_columns_without_names_and_matrices_of_poses(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", *(events()[role] for role in "pxyt"))
+    same(open_recording(tmp_path / "a.npz"))
+    others = {"K": np.eye(4), "pose": np.random.default_rng(0).normal(size=(30, 4)), "quaternions": np.zeros((4, 4))}
+    np.savez(tmp_path / "b.npz", events=table("xypt"), **others)
+    same(open_recording(tmp_path / "b.npz"))
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["raw"] = table("ptxy")
+        for name, matrix in others.items():
+            file[name] = matrix
+    same(open_recording(tmp_path / "c.h5"))
+    with h5py.File(tmp_path / "c.h5", "a") as file:
+        for role, column in events().items():
+            file[f"named/{role}"] = column
+    assert "events in /named," in open_recording(tmp_path / "c.h5").format
+    same(open_recording(tmp_path / "c.h5", part="raw"))
