@@ -22,14 +22,14 @@ def basin_figure(records: Sequence[Record]) -> Figure:
     figure, axes = plt.subplots(1, len(_ERRORS), figsize=(9.0, 4.2))
     for axis, (name, title) in zip(axes, _ERRORS.items(), strict=True):
         scenes = list(dict.fromkeys(record["scene"] for record in records))
-        values = [1.0]
+        values: list[float] = []
         for scene, marker in zip(scenes, "osD^v<>Px*" * len(scenes), strict=False):
             points = [_before_and_after(record, name) for record in records if record["scene"] == scene]
             known = [point for point in points if point]
             if known:
                 axis.plot(*zip(*known, strict=True), marker, label=scene, alpha=0.6, ls="none")
                 values += [value for point in known for value in point]
-        ends = [min(values) / 1.5, max(values) * 1.5]
+        ends = [min(values, default=0.1) / 1.5, max(values, default=1.0) * 1.5]
         axis.plot(ends, ends, color="grey", lw=0.8, label="as before")
         axis.set(xscale="log", yscale="log", xlabel=f"given: {title}", ylabel=f"refined: {title}")
         axis.grid(alpha=0.3, which="both")
@@ -39,9 +39,9 @@ def basin_figure(records: Sequence[Record]) -> Figure:
 
 
 def worse_than_given(records: Sequence[Record]) -> list[Record]:
-    """Trainings that left positions or rotations worse than they were, by more than a 20th."""
+    """Trainings that left positions or rotations that were not exact worse than they were, by more than a 20th."""
     pairs = [(record, name, _before_and_after(record, name)) for record in records for name in _ERRORS]
-    worse = [record for record, name, pair in pairs if pair and pair[1] > _WORSE * max(pair[0], 2 * _EXACT[name])]
+    worse = [record for record, name, pair in pairs if pair and pair[0] > _EXACT[name] and pair[1] > _WORSE * pair[0]]
     return [record for k, record in enumerate(worse) if record not in worse[:k]]
 
 
