@@ -222,8 +222,9 @@ def _assemble(
     if initial is None:
         raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
     notes += _doubts(source, span_us, initial, intake.time_offset_us)
-    windowed = intake.start_us is not None or intake.end_us is not None
-    notes += _apart(initial, span_us, settings.trajectory or source.path, windowed)
+    # Who cut out a window, or said the events' unit, is told, not stopped.
+    meant = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
+    notes += _apart(initial, span_us, settings.trajectory or source.path, meant)
     initial = _clipped(initial, span_us, settings.trajectory or source.path)
     notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
     write_tum(folder / "trajectory.txt", initial)
@@ -300,7 +301,8 @@ def _doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, of
     doubt = f"events over {seconds:.6f} s, if their times are in {unit}, beside a trajectory over {of_poses:.3f} s"
     if others:
         raise RecordingError(
-            f"{source.path}: {doubt}; expected --event-time-unit with {' or '.join(others)}, or {unit} if it is right"
+            f"{source.path}: {doubt}; expected --event-time-unit with {' or '.join(others)}, or {unit} if it is right, "
+            "or another --pose-time-unit"
         )
     return [f"suspicious: {doubt}; --event-time-unit says another unit"]
 
@@ -330,7 +332,7 @@ def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Tr
     return clipped
 
 
-def _apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, windowed: bool) -> list[str]:
+def _apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, meant: bool) -> list[str]:
     """What is odd where all events lie between two poses; raises :class:`TrajectoryError` where nothing explains it."""
     t_us, events_s = trajectory.t_us, (span_us[1] - span_us[0]) * 1e-6
     among = int(within_span(t_us, torch.tensor(span_us)).sum())
@@ -338,7 +340,7 @@ def _apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, windowe
     if among >= 2 or not bool(within_span(torch.tensor(span_us), t_us).any()):
         return []
     said = f"{path}: the {len(t_us)} poses span {poses_s:g} s, with {among} of them among the events, which span "
-    if poses_s > _LONGEST_SPAN_RATIO * events_s and not windowed:
+    if poses_s > _LONGEST_SPAN_RATIO * events_s and not meant:
         raise TrajectoryError(f"{said}{events_s:g} s; expected one unit of time: --event-time-unit or --pose-time-unit")
     return [f"{said}{events_s:g} s: times in another unit? (--event-time-unit, --pose-time-unit)"]
 

@@ -117,7 +117,7 @@ def test_process_ecd_without_frames(tmp_path: Path):
         ({"events_txt": "0.1 1 1\n"}, "events.txt:1:"),
         ({"events_txt": ""}, "holds no events"),
         ({"calib_txt": "1 2 3"}, "calib.txt: holds '1 2 3', expected 9 numbers"),
-        ({"calib_txt": "a b c d e f g h i"}, "calib.txt: could not convert"),
+        ({"calib_txt": "a b c d e f g h i"}, "calib.txt: holds 'a b c d e f g h i', expected 9 numbers"),
         ({"groundtruth_txt": "50 0 0 0 0 0 0 1\n51 0 0 0 0 0 0 1\n"}, "expected at least 2 poses around the events"),
         ({"groundtruth_txt": "0 0 0 0 0 0 0 1\n200000 0 0 0 0 0 0 2\n"}, "has length 2, expected 1"),
         ({"images_txt": "0.1 gone.png\n"}, "images.txt:1:"),

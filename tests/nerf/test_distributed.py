@@ -88,7 +88,9 @@ def test_batches_differ_and_gradients_agree(ranks: list[dict[str, Any]]):
         assert not (a == b).all()
     assert one["gradients"].keys() == two["gradients"].keys() and "camera_optimizer.correction" in one["gradients"]
     for name, gradient in one["gradients"].items():
-        assert gradient.abs().sum() > 0 and torch.equal(gradient, two["gradients"][name])
+        # The clock is learned only where it was off.
+        assert gradient.abs().sum() > 0 or name == "camera_optimizer.clock_px"
+        assert torch.equal(gradient, two["gradients"][name])
 
 
 def test_both_processes_end_with_one_model_after_their_budget(ranks: list[dict[str, Any]]):
@@ -131,4 +133,4 @@ def test_the_gradient_is_the_mean_of_both_batches(ranks: list[dict[str, Any]], t
         alone.append(gradients(ready))
     for name, gradient in ranks[0]["gradients"].items():
         mean = (alone[0][name] + alone[1][name]) / 2
-        assert (gradient - mean).abs().max() < 1e-4 * mean.abs().max(), name
+        assert (gradient - mean).abs().max() <= 1e-4 * mean.abs().max(), name
