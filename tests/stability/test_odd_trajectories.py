@@ -69,11 +69,11 @@ def changed(scene: Path, into: Path, change: Callable[[Rows], Rows]) -> Path:
 @pytest.mark.parametrize(
     "change",
     [
-        two,
         sparse,
         *(
             pytest.param(one, marks=pytest.mark.slow)
             for one in (
+                two,
                 all_alike,
                 drift_of_20_degrees,
                 an_error_in_one_stretch,
