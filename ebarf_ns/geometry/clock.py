@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import f as f_distribution
 
-from ebarf_ns.geometry.so3 import quat_wxyz_exp, quat_wxyz_multiply, rotate, turn_between
+from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_exp, quat_wxyz_multiply, rotate, turn_between
 from ebarf_ns.geometry.trajectory import Interpolation, Poses, Trajectory, interpolate, within_span
 
 if TYPE_CHECKING:
@@ -105,8 +105,7 @@ def offset_by_activity(
     rate = np.log(gaussian_filter1d(counts.astype(float), _SMOOTH_BINS) + 1)
     poses = interpolate(given.t_us, given.poses, edges_us, kind)
     turn = turn_between(poses.quat_wxyz[:-1], poses.quat_wxyz[1:])[:, None].double()
-    back = poses.quat_wxyz[:-1] * poses.quat_wxyz.new_tensor([1.0, -1, -1, -1])
-    shift = rotate(back, poses.position.diff(dim=0))[:, None].double()
+    shift = rotate(quat_wxyz_conjugate(poses.quat_wxyz[:-1]), poses.position.diff(dim=0))[:, None].double()
     towards = bearings[None].to(turn)
     across = shift - (shift * towards).sum(dim=-1, keepdim=True) * towards
     moved = (torch.linalg.cross(turn, towards) + across).square().sum(dim=-1).mean(dim=-1).sqrt()

@@ -14,7 +14,8 @@ import torch
 
 from ebarf_ns.geometry.clock import offset_by_activity
 from ebarf_ns.geometry.so3 import rotate
-from ebarf_ns.nerf.coarse import CoarseTraining, between, coarse_model, gain, heldout_losses, set_rate
+from ebarf_ns.geometry.trajectory import Trajectory
+from ebarf_ns.nerf.coarse import CoarseTraining, between, coarse_model, gain, losses_from_trajectory, set_rate
 from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 from ebarf_ns.radiance.ray_sampling import Rays
 
@@ -163,12 +164,10 @@ def _set_intrinsics(model: EbarfModel, datamanager: EventDataManager, steps: int
 
 def _is_better(model: EbarfModel, datamanager: EventDataManager, offset_us: int, seed: int) -> bool:
     """Whether a field predicts held-out events better if the clock is shifted, and poses left as they are."""
-    losses = []
+    losses, start = [], model.camera_optimizer.start_trajectory()
     for shift_us in (0, offset_us):
-        coarse = coarse_model(model, "off")
-        coarse.camera_optimizer.begin_from(model.camera_optimizer.start_trajectory().poses)
-        coarse.camera_optimizer.shift_clock(shift_us)
-        found = heldout_losses(coarse, CoarseTraining(coarse, datamanager, _CLOCK_STEPS, seed))
+        shifted = Trajectory(start.t_us + shift_us, start.poses)
+        found = losses_from_trajectory(model, datamanager, _CLOCK_STEPS, seed, shifted)
         if found is None:
             return False
         losses.append(found)

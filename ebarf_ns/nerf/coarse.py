@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+    from ebarf_ns.geometry.trajectory import Trajectory
     from ebarf_ns.nerf.datamanager import EventDataManager
     from ebarf_ns.nerf.model import EbarfModel, EbarfModelConfig
     from ebarf_ns.radiance.hash_grid import HashGrid
@@ -101,6 +102,24 @@ def heldout_losses(coarse: EbarfModel, training: CoarseTraining) -> Float[np.nda
             pairs = {name: column[inside] for name, column in batch.items()}
             losses[k] = float(coarse.get_loss_dict(one, pairs)["event_loss"])
     return losses if np.isfinite(losses).any() else None
+
+
+def losses_from_trajectory(
+    model: EbarfModel,
+    datamanager: EventDataManager,
+    steps: int,
+    seed: int,
+    trajectory: Trajectory,
+    given_camera: bool = False,
+) -> Float[np.ndarray, "blocks"] | None:
+    """:func:`heldout_losses` of a coarse field trained from a trajectory, with learned intrinsics or those given."""
+    coarse = coarse_model(model, "off")
+    keyframes = coarse.camera_optimizer
+    keyframes.begin_from(trajectory.poses)
+    keyframes.shift_clock(int(trajectory.t_us[0] - keyframes.keyframe_t_us[0]))
+    if coarse.intrinsics and given_camera:
+        torch.nn.init.zeros_(coarse.intrinsics.correction)
+    return heldout_losses(coarse, CoarseTraining(coarse, datamanager, steps, seed))
 
 
 def gain(worse: Float[np.ndarray, "blocks"], better: Float[np.ndarray, "blocks"]) -> float:

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from ebarf_ns.geometry.clock import differences_less_similarity
-from ebarf_ns.geometry.so3 import rotate
+from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, rotate
 from ebarf_ns.geometry.trajectory import Trajectory, corrected
-from ebarf_ns.nerf.coarse import CoarseTraining, coarse_model, gain, heldout_losses
+from ebarf_ns.nerf.coarse import gain, losses_from_trajectory
 from ebarf_ns.radiance.ray_sampling import Rays
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: 
     """Ask held-out events by coarse fields of so many steps each; None if a number is not finite."""
     keyframes = model.camera_optimizer
     given = Trajectory(keyframes.keyframe_t_us - keyframes.clock_offset_us, keyframes.initial())
-    losses_from = partial(_losses, model, datamanager, steps, seed)
+    losses_from = partial(losses_from_trajectory, model, datamanager, steps, seed)
     loss_given, loss_refined = losses_from(given, given_camera=True), losses_from(keyframes.trajectory())
     if loss_given is None or loss_refined is None:
         return None
@@ -124,23 +124,6 @@ def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: 
     )
 
 
-def _losses(
-    model: EbarfModel,
-    datamanager: EventDataManager,
-    steps: int,
-    seed: int,
-    trajectory: Trajectory,
-    given_camera: bool = False,
-) -> Losses | None:
-    coarse = coarse_model(model, "off")
-    keyframes = coarse.camera_optimizer
-    keyframes.begin_from(trajectory.poses)
-    keyframes.shift_clock(int(trajectory.t_us[0] - keyframes.keyframe_t_us[0]))
-    if coarse.intrinsics and given_camera:
-        torch.nn.init.zeros_(coarse.intrinsics.correction)
-    return heldout_losses(coarse, CoarseTraining(coarse, datamanager, steps, seed))
-
-
 def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from: LossesFrom) -> WeakDirection | None:
     """Which of two motions that a young field mistakes for relief is told worst (the bas-relief ambiguity, Belhumeur,
     Kriegman and Yuille 1999): the camera turns as it moves aside, or tilts as it moves up, and shifts back by as much.
@@ -150,8 +133,7 @@ def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from:
     """
     refined = model.camera_optimizer.trajectory()
     position, quat_wxyz = refined.poses
-    upright = quat_wxyz[:1] * quat_wxyz.new_tensor([1.0, -1, -1, -1])
-    place = rotate(upright.expand_as(quat_wxyz), position - position.mean(dim=0))
+    place = rotate(quat_wxyz_conjugate(quat_wxyz[:1]).expand_as(quat_wxyz), position - position.mean(dim=0))
     turn_rad, found = _ASKED_PX * model.camera_optimizer.pixel_rad, []
     for name, turned, shifted, sign in _BAS_RELIEFS:
         size = place[:, shifted].square().mean().sqrt()

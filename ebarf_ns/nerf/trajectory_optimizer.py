@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ebarf_ns.geometry.clock import ClockOffset, clock_offset
 from ebarf_ns.geometry.smoothing import smoothed
-from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix, rotate, turn_between
+from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, quat_wxyz_to_matrix, rotate, turn_between
 from ebarf_ns.geometry.trajectory import (
     Interpolation,
     Poses,
@@ -327,7 +327,5 @@ def _every(stride: int, count: int) -> Int[Tensor, "knots"]:
 
 def _correction(some: Poses, others: Poses) -> Float[Tensor, "keyframes 6"]:
     """What takes ``some`` to ``others``, by :func:`corrected`."""
-    back = some.quat_wxyz * some.quat_wxyz.new_tensor([1.0, -1, -1, -1])
-    return torch.cat(
-        [turn_between(some.quat_wxyz, others.quat_wxyz), rotate(back, others.position - some.position)], dim=-1
-    )
+    shift = rotate(quat_wxyz_conjugate(some.quat_wxyz), others.position - some.position)
+    return torch.cat([turn_between(some.quat_wxyz, others.quat_wxyz), shift], dim=-1)
