@@ -1,1 +1,1 @@
-"""What measures the project."""
+"""Methods compared, and the engine timed."""

@@ -20,8 +20,8 @@ import numpy as np
 
 from ebarf_ns.benchmarks.engine import Figure, machine
 from ebarf_ns.benchmarks.settings import RecordingsBenchmark
-from ebarf_ns.events.intake import Intake, take_in
-from ebarf_ns.events.recognise import open_recording
+from ebarf_ns.formats.intake import Intake, take_in
+from ebarf_ns.formats.recognise import open_recording
 from ebarf_ns.memory import peak_memory_mib
 
 SIZE = (640, 480)

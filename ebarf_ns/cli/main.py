@@ -13,8 +13,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError, one_line_errors
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
-from ebarf_ns.process import Format, ProcessSettings
+from ebarf_ns.formats.process import Format, ProcessSettings
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
 
@@ -58,7 +58,7 @@ class Process:
 
     def run(self) -> None:
         """Make the scene and say what is in it."""
-        from ebarf_ns.process import process
+        from ebarf_ns.formats.process import process
 
         _refuse_existing(self.output)
         source = self.folder or self.source
@@ -93,7 +93,7 @@ class Inspect:
 
     def run(self) -> None:
         """Print the summary."""
-        from ebarf_ns.events.recognise import recognised_folder
+        from ebarf_ns.formats.recognise import recognised_folder
 
         # A folder that is neither is taken for a scene, and told what it lacks.
         if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
@@ -104,8 +104,8 @@ class Inspect:
             _print_json(asdict(summary))
 
     def _recording(self) -> Any:
-        from ebarf_ns.events.recognise import open_recording
-        from ebarf_ns.raw_inspection import contact_sheet, inspect_recording, print_raw_summary
+        from ebarf_ns.formats.raw_inspection import contact_sheet, inspect_recording, print_raw_summary
+        from ebarf_ns.formats.recognise import open_recording
 
         if self.picture and self.picture.suffix.lower() != ".png":
             raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")

@@ -12,8 +12,7 @@ from ebarf_ns.evaluation.trajectory_error import (
     rotation_error_deg,
     rotation_errors_by_positions_deg,
 )
-from ebarf_ns.geometry.trajectory import Poses, Trajectory
-from ebarf_ns.geometry.trajectory_formats import (
+from ebarf_ns.formats.trajectory_formats import (
     NOTHING_KNOWN,
     Axes,
     Quaternion,
@@ -25,6 +24,7 @@ from ebarf_ns.geometry.trajectory_formats import (
     read_trajectory,
     trajectory_of,
 )
+from ebarf_ns.geometry.trajectory import Poses, Trajectory
 
 # The right convention is better than all others by this factor, or the motion cannot tell.
 _CLEARLY = 0.5

@@ -13,7 +13,7 @@ import pytest
 from ebarf_ns.events.recording import read_recording
 from ebarf_ns.scene import read_scene
 from tests.conftest import REPOSITORY, TINY_TRAINING, run_ok
-from tests.events import writers
+from tests.formats import writers
 
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", README, re.S)]

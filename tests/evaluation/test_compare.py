@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import TrajectoryError
 from ebarf_ns.evaluation.compare import compare_files, read_beside_reference, read_by_reference
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
 from tests.conftest import DATA
 
 

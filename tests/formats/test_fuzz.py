@@ -7,10 +7,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.intake import Intake, take_in
-from ebarf_ns.events.recognise import RecordingFormat, open_recording
+from ebarf_ns.formats.intake import Intake, take_in
+from ebarf_ns.formats.recognise import RecordingFormat, open_recording
 from tests.conftest import DATA
-from tests.events.test_recognise import MADE, SINGLE, SIZE
+from tests.formats.test_recognise import MADE, SINGLE, SIZE
 
 FORMATS: list[RecordingFormat] = ["hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "mat", "text"]
 EDIT = st.tuples(

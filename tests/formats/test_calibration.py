@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ebarf_ns.calibration import read_calibration, read_cameras
 from ebarf_ns.errors import SceneError
+from ebarf_ns.formats.calibration import read_calibration, read_cameras
 from ebarf_ns.geometry.cameras import Camera
 
 MATRIX = "[ 60., 0., 32., 0., 61., 24., 0., 0., 1. ]"

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.readers.ecf import decode
-from ebarf_ns.events.readers.prophesee import Decoder, read_dat, read_raw
+from ebarf_ns.formats.readers.ecf import decode
+from ebarf_ns.formats.readers.prophesee import Decoder, read_dat, read_raw
 from tests.conftest import DATA
-from tests.events import writers
+from tests.formats import writers
 
 ENCODERS = {"evt2": writers.evt2, "evt2.1": writers.evt21, "evt3": writers.evt3}
 EVENTS = st.lists(

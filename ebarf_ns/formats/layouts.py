@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.calibration import Calibrated, pose_matrix, read_calibration, read_cameras
 from ebarf_ns.errors import SceneError
-from ebarf_ns.events.readers.arrays import read_npy, read_npz
-from ebarf_ns.events.readers.hdf5 import read_hdf5
-from ebarf_ns.events.readers.text import read_text
-from ebarf_ns.events.source import Source, TimeUnit
 from ebarf_ns.files import opened_npz
+from ebarf_ns.formats.calibration import Calibrated, pose_matrix, read_calibration, read_cameras
+from ebarf_ns.formats.readers.arrays import read_npy, read_npz
+from ebarf_ns.formats.readers.hdf5 import read_hdf5
+from ebarf_ns.formats.readers.text import read_text
+from ebarf_ns.formats.source import Source, TimeUnit
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.scene import ContrastThreshold, FrameIntensity
 
 Layout = Literal["ecd", "tumvie", "eds", "esim", "robust-e-nerf"]

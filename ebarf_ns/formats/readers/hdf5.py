@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import (
+from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
     guessed_unit,
@@ -29,8 +29,8 @@ from ebarf_ns.events.columns import (
     told_order,
     unit_of,
 )
-from ebarf_ns.events.readers import ecf
-from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
+from ebarf_ns.formats.readers import ecf
+from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 
 with suppress(ImportError):
     import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5

@@ -17,7 +17,8 @@ import numpy as np
 from scipy.io import loadmat
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import (
+from ebarf_ns.files import opened_npz
+from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
     guessed_unit,
@@ -30,8 +31,7 @@ from ebarf_ns.events.columns import (
     told_order,
     unit_of,
 )
-from ebarf_ns.events.source import Piece, Source, TimeUnit, fits, microseconds, numbered
-from ebarf_ns.files import opened_npz
+from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 
 _EVENTS_AT_ONCE = 1 << 20
 _ESIM = "xytp"

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import parsed_order
-from ebarf_ns.events.readers.text import read_text
-from ebarf_ns.events.source import Source, TimeUnit
+from ebarf_ns.formats.columns import parsed_order
+from ebarf_ns.formats.readers.text import read_text
+from ebarf_ns.formats.source import Source, TimeUnit
 
 RecordingFormat = Literal["hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "mat", "text"]
 _MAGIC: dict[bytes, RecordingFormat] = {
@@ -43,23 +43,23 @@ def _opened(
 ) -> Source:
     # Some of the libraries take long to import, and each file needs one of them.
     if found == "hdf5":
-        from ebarf_ns.events.readers.hdf5 import read_hdf5
+        from ebarf_ns.formats.readers.hdf5 import read_hdf5
 
         return read_hdf5(path, part, time_unit, order)
     if found == "aedat4":
-        from ebarf_ns.events.readers.aedat4 import read_aedat4
+        from ebarf_ns.formats.readers.aedat4 import read_aedat4
 
         return read_aedat4(path)
     if found == "bag":
-        from ebarf_ns.events.readers.bags import read_bag
+        from ebarf_ns.formats.readers.bags import read_bag
 
         return read_bag(path, part)
     if found in ("raw", "dat"):
-        from ebarf_ns.events.readers.prophesee import read_dat, read_raw
+        from ebarf_ns.formats.readers.prophesee import read_dat, read_raw
 
         return read_raw(path) if found == "raw" else read_dat(path)
     if found in ("npz", "npy", "mat"):
-        from ebarf_ns.events.readers.arrays import read_mat, read_npy, read_npz
+        from ebarf_ns.formats.readers.arrays import read_mat, read_npy, read_npz
 
         if found == "npy":
             return read_npy(path, time_unit, order)

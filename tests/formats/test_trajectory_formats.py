@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.trajectory import Trajectory
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
 from tests.conftest import DATA
 
 COUNT = 12

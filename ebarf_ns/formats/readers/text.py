@@ -18,8 +18,8 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
-from ebarf_ns.events.source import DECIMALS, Piece, Source, TimeUnit
+from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
+from ebarf_ns.formats.source import DECIMALS, Piece, Source, TimeUnit
 
 _BLOCK_BYTES = 1 << 22
 _TIME, _X, _Y, _POLARITY, _LINE, _TABLE = range(6)

@@ -12,7 +12,7 @@ from typing import get_args
 import numpy as np
 
 from ebarf_ns.errors import TrajectoryError
-from ebarf_ns.geometry.raw_poses import (
+from ebarf_ns.formats.raw_poses import (
     Quaternion,
     RawPoses,
     TimeUnit,

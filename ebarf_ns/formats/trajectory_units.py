@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ebarf_ns.errors import TrajectoryError
-from ebarf_ns.geometry.raw_poses import TimeUnit
+from ebarf_ns.formats.raw_poses import TimeUnit
 
 US: dict[TimeUnit, Decimal] = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
 # Poses come a tenth of a millisecond to ten seconds apart, and those in milliseconds at 1 to 1000 a second.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.source import DECIMALS, TimeUnit
+from ebarf_ns.formats.source import DECIMALS, TimeUnit
 
 if TYPE_CHECKING:
     from jaxtyping import Num

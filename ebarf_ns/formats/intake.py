@@ -18,7 +18,7 @@ from numba import njit
 
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.recording import Recording, joined, write_recording
-from ebarf_ns.events.source import Piece, Source
+from ebarf_ns.formats.source import Piece, Source
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64

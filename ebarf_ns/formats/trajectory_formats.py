@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import TrajectoryError
 from ebarf_ns.files import opened_npz
-from ebarf_ns.geometry.raw_poses import (
+from ebarf_ns.formats.raw_poses import (
     NOTHING_KNOWN,
     Axes,
     Quaternion,
@@ -32,9 +32,9 @@ from ebarf_ns.geometry.raw_poses import (
     rotations,
     times_beside,
 )
+from ebarf_ns.formats.trajectory_text import read_text
+from ebarf_ns.formats.trajectory_units import US, recognised_unit
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
-from ebarf_ns.geometry.trajectory_text import read_text
-from ebarf_ns.geometry.trajectory_units import US, recognised_unit
 
 __all__ = [
     "NOTHING_KNOWN",

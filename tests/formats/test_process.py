@@ -14,20 +14,20 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.calibration import read_calibration, read_cameras
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError
-from ebarf_ns.events.intake import Intake
-from ebarf_ns.events.recognise import open_recording
 from ebarf_ns.events.recording import read_recording
+from ebarf_ns.formats.calibration import read_calibration, read_cameras
+from ebarf_ns.formats.intake import Intake
+from ebarf_ns.formats.process import ProcessSettings, process
+from ebarf_ns.formats.raw_inspection import inspect_recording
+from ebarf_ns.formats.recognise import open_recording
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat
 from ebarf_ns.inspection import inspect_scene
-from ebarf_ns.process import ProcessSettings, process
-from ebarf_ns.raw_inspection import inspect_recording
 from ebarf_ns.scene import read_scene
 from tests.conftest import DATA, REPOSITORY, run_command, run_ok
-from tests.events import writers
-from tests.events.test_recognise import bag1, messages, types
+from tests.formats import writers
+from tests.formats.test_recognise import bag1, messages, types
 
 STEREO = [("sensor_msgs", "Image"), ("std_msgs", "Header"), ("builtin_interfaces", "Time")]
 COMPRESSED = [("sensor_msgs", "CompressedImage"), *STEREO[1:]]

@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.intake import checked
-from ebarf_ns.events.readers import text
-from ebarf_ns.events.readers.text import read_text
 from ebarf_ns.events.recording import Recording
-from ebarf_ns.events.source import TimeUnit
+from ebarf_ns.formats.intake import checked
+from ebarf_ns.formats.readers import text
+from ebarf_ns.formats.readers.text import read_text
+from ebarf_ns.formats.source import TimeUnit
 
 WIDTH, HEIGHT = 240, 180
 

@@ -14,11 +14,11 @@ from scipy.io import savemat
 
 from ebarf_ns.benchmarks.recordings import aedat4
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.intake import Intake, checked, take_in
-from ebarf_ns.events.recognise import open_recording
 from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.formats.intake import Intake, checked, take_in
+from ebarf_ns.formats.recognise import open_recording
 from tests.conftest import DATA
-from tests.events import writers
+from tests.formats import writers
 
 SIZE = (640, 480)
 EVENTS: list[writers.Event] = [(1000 * k, k % 640, (7 * k) % 480, k % 2) for k in range(300)]
@@ -174,10 +174,10 @@ def test_the_same_events_come_out_of_every_format(tmp_path: Path, name: str):
 @pytest.mark.parametrize("size", [1, 7])
 def test_pieces_of_any_size_are_the_same_events(tmp_path: Path, name: str, size: int, monkeypatch: pytest.MonkeyPatch):
     path, expected = MADE[name](tmp_path / name), writers.recording(EVENTS)
-    monkeypatch.setattr("ebarf_ns.events.readers.hdf5._EVENTS_AT_ONCE", size)
-    monkeypatch.setattr("ebarf_ns.events.readers.arrays._EVENTS_AT_ONCE", size)
-    monkeypatch.setattr("ebarf_ns.events.readers.prophesee._BYTES_AT_ONCE", 8 * size)
-    monkeypatch.setattr("ebarf_ns.events.readers.text._BLOCK_BYTES", 8 * size)
+    monkeypatch.setattr("ebarf_ns.formats.readers.hdf5._EVENTS_AT_ONCE", size)
+    monkeypatch.setattr("ebarf_ns.formats.readers.arrays._EVENTS_AT_ONCE", size)
+    monkeypatch.setattr("ebarf_ns.formats.readers.prophesee._BYTES_AT_ONCE", 8 * size)
+    monkeypatch.setattr("ebarf_ns.formats.readers.text._BLOCK_BYTES", 8 * size)
     back = checked(open_recording(path), SIZE)
     for column in ("x", "y", "t_us", "polarity"):
         assert np.array_equal(getattr(back, column), getattr(expected, column)), column

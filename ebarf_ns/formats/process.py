@@ -16,20 +16,20 @@ import cv2
 import numpy as np
 import torch
 
-from ebarf_ns.calibration import read_calibration
 from ebarf_ns.errors import RecordingError, SceneError, TrajectoryError
 from ebarf_ns.evaluation.compare import read_beside_reference
-from ebarf_ns.events.intake import Intake, hot_pixels, take_in
-from ebarf_ns.events.recognise import RecordingFormat, open_recording, recognised, recognised_folder
-from ebarf_ns.events.source import DECIMALS, Source, TimeUnit
 from ebarf_ns.files import whole_folder
+from ebarf_ns.formats.calibration import read_calibration
+from ebarf_ns.formats.intake import Intake, hot_pixels, take_in
+from ebarf_ns.formats.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
+from ebarf_ns.formats.recognise import RecordingFormat, open_recording, recognised, recognised_folder
+from ebarf_ns.formats.source import DECIMALS, Source, TimeUnit
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
 from ebarf_ns.geometry.trajectory_file import write_tum
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.trajectory_jumps import torn
-from ebarf_ns.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
 # A trajectory this much longer than its recording, with no two poses among the events, is in another unit of time.
@@ -177,11 +177,11 @@ def _frames_within(
 ) -> Iterator[FrameFile]:
     """The pictures that a DAVIS takes with the pixels of its events."""
     if format == "aedat4":
-        from ebarf_ns.events.readers.aedat4 import read_aedat4_frames
+        from ebarf_ns.formats.readers.aedat4 import read_aedat4_frames
 
         pictures = read_aedat4_frames(source)
     elif format == "bag":
-        from ebarf_ns.events.readers.bags import read_bag_frames
+        from ebarf_ns.formats.readers.bags import read_bag_frames
 
         pictures = read_bag_frames(source, opened().sensor_size or (0, 0), part, left_out)
     else:

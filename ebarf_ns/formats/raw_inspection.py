@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.intake import far_busier
-from ebarf_ns.events.source import Piece, Source
 from ebarf_ns.files import whole_file
+from ebarf_ns.formats.intake import far_busier
+from ebarf_ns.formats.source import Piece, Source
 
 _LARGEST_SENSOR = 8192
 _SLOT_US = 100_000

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.source import Piece, Source, numbered
+from ebarf_ns.formats.source import Piece, Source, numbered
 
 Encoding = Literal["evt2", "evt2.1", "evt3"]
 _WORD: dict[Encoding, str] = {"evt2": "<u4", "evt2.1": "<u8", "evt3": "<u2"}

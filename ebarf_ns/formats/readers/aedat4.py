@@ -11,7 +11,7 @@ import aedat
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.source import Piece, Source, numbered
+from ebarf_ns.formats.source import Piece, Source, numbered
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 

@@ -19,8 +19,8 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.readers.prophesee import Decoder, note_dropped
-from ebarf_ns.events.source import Piece, Source
+from ebarf_ns.formats.readers.prophesee import Decoder, note_dropped
+from ebarf_ns.formats.source import Piece, Source
 
 _ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 _PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")

@@ -10,10 +10,10 @@ import pytest
 from scipy.io import savemat
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.columns import guessed_unit, named, unit_of
-from ebarf_ns.events.intake import Intake, checked, take_in
-from ebarf_ns.events.recognise import open_recording
-from ebarf_ns.events.source import Source
+from ebarf_ns.formats.columns import guessed_unit, named, unit_of
+from ebarf_ns.formats.intake import Intake, checked, take_in
+from ebarf_ns.formats.recognise import open_recording
+from ebarf_ns.formats.source import Source
 
 SIZE = (64, 48)
 ORDERS = ["".join(order) for order in permutations("txyp") if order.index("x") < order.index("y")]

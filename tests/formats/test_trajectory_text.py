@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.geometry.trajectory_formats import TrajectoryFormat, read_trajectory
 from tests.geometry.test_trajectory_formats import COUNT, POSITION, QUAT, T_US, check, matrices, rows, seconds, tum
 
 WXYZ = QUAT[:, [3, 0, 1, 2]]

@@ -1,0 +1,1 @@
+"""Recordings, their sensor, and pairs of events."""

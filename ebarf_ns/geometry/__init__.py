@@ -1,0 +1,1 @@
+"""From time to pose: trajectories, rotations, cameras, clocks."""

@@ -1,0 +1,1 @@
+"""The plugin: what nerfstudio trains, loads and shows."""

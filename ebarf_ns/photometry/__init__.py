@@ -1,0 +1,1 @@
+"""From brightness to events: sensor response and event loss."""

@@ -1,0 +1,1 @@
+"""The field and its rendering: hash grid, samples along rays."""

@@ -1,0 +1,1 @@
+"""The project's own event camera, for tests and demos."""
