@@ -8,7 +8,7 @@ import pytest
 from ebarf_ns.errors import TrajectoryError
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
-from tests.geometry.test_trajectory_formats import COUNT, POSITION, QUAT, T_US, check, matrices, rows, seconds, tum
+from tests.formats.test_trajectory_formats import COUNT, POSITION, QUAT, T_US, check, matrices, rows, seconds, tum
 
 WXYZ = QUAT[:, [3, 0, 1, 2]]
 NS = [str(1000 * t) for t in T_US.tolist()]
