@@ -89,10 +89,10 @@ class ViewerPanel(ViewerControl):
         times = model.camera_optimizer.keyframe_t_us
         self._given = model.camera_optimizer.given.nonzero()[:, 0].cpu()
         shown = {
-            "initial": "initial trajectory (blue)",
-            "refined": "refined trajectory (orange)",
-            "reference": "reference (dashed green)",
-            "keyframes": f"keyframes ({len(self._drawn.keyframes):,} of {len(self._given):,} drawn)",
+            "initial": "initial, blue",
+            "refined": "refined, orange",
+            "reference": "reference, green",
+            "keyframes": "keyframes",
         }
         if self._pipeline.scene.groundtruth is None:
             del shown["reference"]
@@ -115,12 +115,14 @@ class ViewerPanel(ViewerControl):
                     node = scene.add_frame(f"/{name}", show_axes=False)
                     box = gui.add_checkbox(label, True)
                     box.on_update(lambda event, node=node: setattr(node, "visible", event.target.value))
+                if len(self._drawn.keyframes) < len(self._given):
+                    gui.add_markdown(f"{len(self._drawn.keyframes):,} of {len(self._given):,} keyframes are drawn.")
             with gui.add_folder("Brightness"):
                 exposure = gui.add_slider("exposure [stops]", -5.0, 5.0, 0.1, model.exposure)
                 gamma = gui.add_slider("gamma", 0.4, 3.0, 0.1, model.gamma)
                 exposure.on_update(lambda event: self._display(exposure=event.target.value))
                 gamma.on_update(lambda event: self._display(gamma=event.target.value))
-            with gui.add_folder("Progress", expand_by_default=False) as folder:
+            with gui.add_folder("Progress") as folder:
                 self._progress = folder
             self._curves: viser.GuiPlotlyHandle | None = None
         self._time.on_update(lambda _: self._go_to_time())
@@ -236,7 +238,7 @@ class ViewerPanel(ViewerControl):
         self._picture.content = f"{moment.says} on the clock of the events\n\n![](data:image/png;base64,{encoded})"
 
     def _draw_curves(self) -> None:
-        figure = curves([*self._evaluated(), *self._live()], unit_known=False)
+        figure = curves([*self._evaluated(), *self._live()])
         if self._curves is None:
             with self._progress:
                 self._curves = self.viser_server.gui.add_plotly(figure, aspect=0.55)

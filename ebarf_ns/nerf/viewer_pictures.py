@@ -29,10 +29,10 @@ _LONGEST_HALF_US = 10_000
 _RAYS_AT_ONCE = 4096
 _DARK, _LIGHT = (36,), (230,)
 _CURVES = (
-    ("loss", "loss", True),
-    ("heldout_event_loss", "unexplained events", True),
-    ("corrected_position", "position", False),
-    ("corrected_rotation_deg", "rotation [deg]", False),
+    ("loss", "loss"),
+    ("heldout_event_loss", "unexplained events"),
+    ("corrected_position", "position"),
+    ("corrected_rotation_deg", "rotation [deg]"),
 )
 _ERRORS = {"corrected_position": "ate_m", "corrected_rotation_deg": "rotation_deg"}
 
@@ -121,36 +121,39 @@ def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width"]], width: 
     return png.tobytes()
 
 
-def curves(records: Sequence[dict[str, Any]], unit_known: bool) -> go.Figure:
+def curves(records: Sequence[dict[str, Any]]) -> go.Figure:
     """Loss, unexplained events, and how far the poses have moved, over the steps; dotted what they are off by."""
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
-    titles = [title + (" [m]" if title == "position" and unit_known else "") for _, title, _ in _CURVES]
-    figure = make_subplots(rows=4, cols=1, shared_xaxes=True, vertical_spacing=0.06, subplot_titles=titles)
+    titles = [title for _, title in _CURVES]
+    figure = make_subplots(rows=len(_CURVES), cols=1, shared_xaxes=True, vertical_spacing=0.08, subplot_titles=titles)
 
     def curve(name: str, row: int, legend: str, **line: Any) -> None:
         known = [record for record in records if record.get(name) is not None]
         steps, values = [one["step"] for one in known], [one[name] for one in known]
-        mode = "lines+markers" if len(known) < 20 else "lines"
-        show = bool(known) and legend not in {trace.name for trace in figure.data}  # pyright: ignore[reportAttributeAccessIssue]
-        figure.add_trace(
-            go.Scatter(x=steps, y=values, mode=mode, line=line, name=legend, showlegend=show and row > 2),
-            row=row,
-            col=1,
+        # One line in the legend stands for both that are alike.
+        trace = go.Scatter(
+            x=steps,
+            y=values,
+            mode="lines+markers" if len(known) < 20 else "lines",
+            line=line,
+            name=legend,
+            showlegend=row == len(_CURVES) and bool(known),
         )
+        figure.add_trace(trace, row=row, col=1)
 
-    for row, (name, _, logarithmic) in enumerate(_CURVES, start=1):
+    for row, (name, _) in enumerate(_CURVES, start=1):
         curve(name, row, "moved by training", color="#ff7f0e", width=2)
         if name in _ERRORS:
             curve(_ERRORS[name], row, "off the reference", color="#2ca02c", width=2, dash="dot")
-        if logarithmic:
-            figure.update_yaxes(type="log", row=row, col=1)
+    figure.update_yaxes(rangemode="tozero", nticks=4)
+    figure.update_yaxes(type="log", dtick="D2", rangemode="normal", row=1, col=1)
+    figure.update_annotations(font={"size": 12, "color": "#dddddd"})
     figure.update_layout(
-        height=560,
         margin={"l": 44, "r": 8, "t": 26, "b": 28},
         template="plotly_dark",
-        font={"size": 11},
+        font={"size": 11, "color": "#dddddd"},
         legend={"orientation": "h", "y": -0.07},
         paper_bgcolor="rgba(0,0,0,0)",
     )
