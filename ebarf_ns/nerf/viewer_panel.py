@@ -61,6 +61,7 @@ class ViewerPanel(ViewerControl):
         self._every = 1
         self._step = 0
         self._drawing = threading.Lock()
+        self._looked_at = False
         self._wanted = self._shown = 0
 
     def _setup(self, viewer: Viewer) -> None:
@@ -78,7 +79,8 @@ class ViewerPanel(ViewerControl):
             button.visible = False
         # Without its logo, which is fetched from the network.
         self.viser_server.gui.configure_theme(control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105))
-        self._chores = [_Chore(self._drawn.draw_lines), _Chore(self._draw_curves), _Chore(self._show_moment_again)]
+        chores = (self._drawn.draw_lines, self._draw_curves, self._pipeline.fit_display_range, self._show_moment_again)
+        self._chores = [_Chore(do) for do in chores]
         self._build()
         self._viewer = viewer
         self.viser_server.on_client_connect(self._welcome)
@@ -138,8 +140,7 @@ class ViewerPanel(ViewerControl):
                 self._losses, self._every = self._losses[::2], 2 * self._every
         now = time.monotonic()
         due = [chore for chore in self._chores if chore.due_s <= now]
-        if due and self._drawn.frustums and self.viser_server.get_clients():
-            self._pipeline.fit_display_range()
+        if due and self._looked_at and self.viser_server.get_clients():
             min(due, key=lambda chore: chore.due_s).run()
 
     # Who comes, and where they look from.
@@ -184,12 +185,13 @@ class ViewerPanel(ViewerControl):
     def _draw_all(self, client: viser.ClientHandle) -> None:
         """What the first to look needs, and nobody before."""
         with self._drawing:
-            if not self._drawn.frustums:
+            if not self._looked_at:
                 self._drawn.draw_keyframes(self._fly)
                 self._drawn.draw_lines()
                 with self._lock():
                     self._pipeline.fit_display_range()
                     self._draw_curves()
+                self._looked_at = True
         self._drawn.clear_the_view(client.camera)
         self._show_moment()
 

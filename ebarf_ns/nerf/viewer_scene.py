@@ -42,6 +42,7 @@ class DrawnScene:
         self.keyframes = given[np.linspace(0, len(given) - 1, count).astype(int)]
         """Numbers of the keyframes that are drawn, evenly over those that came with the scene."""
         self.frustums: list[viser.CameraFrustumHandle] = []
+        self._places = np.zeros((0, 3))
 
     def _poses(self) -> Poses:
         keyframes = self.pipeline.model.camera_optimizer.trajectory().poses
@@ -67,7 +68,7 @@ class DrawnScene:
             )
             handle.on_click(lambda event, keyframe=keyframe: on_click(keyframe, event.client))
             drawn.append(handle)
-        self.frustums = drawn
+        self.frustums, self._places = drawn, SCALE * poses.position.numpy()
 
     @torch.no_grad()
     def draw_lines(self) -> None:
@@ -81,15 +82,17 @@ class DrawnScene:
         self._line("/refined/line", optimizer.poses_at(times).position, _ORANGE, 4.0)
         for k, dash in enumerate(self._reference_dashes()):
             self._line(f"/reference/{k:03d}", dash, _GREEN, 3.0)
-        positions, turns = (column.numpy() for column in self._poses())
-        for handle, position, wxyz in zip(self.frustums, SCALE * positions, turns, strict=bool(self.frustums)):
-            if max(np.abs(handle.position - position).max(), np.abs(handle.wxyz - wxyz).max()) > 1e-4:
-                handle.position, handle.wxyz = position, wxyz
+        poses = self._poses()
+        self._places = SCALE * poses.position.numpy()
+        for handle, place, wxyz in zip(self.frustums, self._places, poses.quat_wxyz.numpy(), strict=True):
+            if max(np.abs(handle.position - place).max(), np.abs(handle.wxyz - wxyz).max()) > 1e-4:
+                handle.position, handle.wxyz = place, wxyz
 
     def clear_the_view(self, camera: viser.CameraHandle) -> None:
         """Hide the frustums that the viewer stands in."""
-        for handle in self.frustums:
-            handle.visible = bool(np.abs(handle.position - camera.position).max() > _NEAR * self.frustum_scale)
+        far = np.abs(self._places - camera.position).max(axis=-1) > _NEAR * self.frustum_scale
+        for handle, visible in zip(self.frustums, far.tolist(), strict=True):
+            handle.visible = visible
 
     def _line(self, name: str, position: Float[Tensor, "points 3"], color: tuple[int, int, int], width: float) -> None:
         every = -(-len(position) // _MOST_POINTS)

@@ -4,11 +4,9 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +18,7 @@ import torch
 
 from ebarf_ns.evaluation.trajectory_error import trajectory_error
 from ebarf_ns.geometry.trajectory_file import read_tum
-from tests.conftest import TINY_TRAINING, run_command, run_ok
+from tests.conftest import TINY_TRAINING, free_port, run_command, run_ok, wait_for_page
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render needs ffmpeg")
 
@@ -296,21 +294,3 @@ def test_viewer_serves_its_page(trained_run: Path):
     finally:
         process.kill()
         process.wait()
-
-
-def wait_for_page(address: str, process: subprocess.Popen, patience_s: float = 120) -> str:
-    end = time.monotonic() + patience_s
-    while time.monotonic() < end:
-        assert process.poll() is None, process.stdout.read().decode() if process.stdout else ""
-        try:
-            with urllib.request.urlopen(address, timeout=5) as answer:
-                return answer.read().decode(errors="replace")
-        except OSError:
-            time.sleep(1)
-    raise AssertionError(f"{address} did not answer in {patience_s} s")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
