@@ -93,7 +93,7 @@ class ViewerPanel(ViewerControl):
         gui, scene = self.viser_server.gui, self.viser_server.scene
         model = self._pipeline.model
         times = model.camera_optimizer.keyframe_t_us
-        self._given = model.camera_optimizer.given.nonzero()[:, 0].cpu()
+        self._given = model.camera_optimizer.given.cpu()
         shown = {
             "initial": "initial, blue",
             "refined": "refined, orange",

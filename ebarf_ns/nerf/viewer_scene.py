@@ -37,7 +37,7 @@ class DrawnScene:
 
     def __init__(self, pipeline: EbarfPipeline, server: viser.ViserServer, most: int, frustum_scale: float):
         self.pipeline, self.server, self.frustum_scale = pipeline, server, frustum_scale
-        given = pipeline.model.camera_optimizer.given.nonzero()[:, 0].cpu()
+        given = pipeline.model.camera_optimizer.given.cpu()
         count = min(len(given), _MOST_FRUSTUMS if most < 0 else min(most, _MOST_FRUSTUMS))
         self.keyframes = given[np.linspace(0, len(given) - 1, count).astype(int)]
         """Numbers of the keyframes that are drawn, evenly over those that came with the scene."""
