@@ -48,6 +48,10 @@ class DrawnScene:
         keyframes = self.pipeline.model.camera_optimizer.trajectory().poses
         return Poses(*(column[self.keyframes.to(column.device)].double().cpu() for column in keyframes))
 
+    def places(self) -> Float[Tensor, "keyframes 3"]:
+        """Where the drawn keyframes are now, in training coordinates."""
+        return self._poses().position
+
     def draw_keyframes(self, on_click: Callable[[int, viser.ClientHandle | None], None]) -> None:
         """A frustum each, with the events around it; a click is told the keyframe's number."""
         camera, times = self.pipeline.scene.camera, self.pipeline.model.camera_optimizer.keyframe_t_us.cpu()
