@@ -85,8 +85,8 @@ def test_a_page_says_all_and_needs_nothing_else(tmp_path: Path):
     np.savez(tmp_path / "moments.npz", **moments, recorded=events, predicted=events)
     page = write_report(tmp_path, trajectories(tmp_path)).read_text()
     for words in (
-        "my &lt;scene&gt;", "The field explains the recording.", "89% of the changes", "25.0 dB", "C_on / C_off is 0.80",
-        "as given",
+        "my &lt;scene&gt;", "The field explains the recording.", "89% of the changes", "25.0 dB",
+        "C_on / C_off is 0.80", "as given",
         "ns-train ebarf --data my_scene", "--pipeline.model.grid-levels 8", "a pixel covers 3 mm", "Errors over time",
         "28.1 dB as", "correlation 1.00",
     ):  # fmt: skip
