@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
 
-from ebarf_ns.errors import SceneError
+from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
 
@@ -73,20 +73,26 @@ class Scene:
     """Of the photoreceptor's low pass, at the mean log brightness of what is seen."""
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner in world units."""
+    missing: tuple[Path, ...] = ()
+    """Files of validation frames that are named and are not there; such frames, or depths, are left out."""
 
 
 def read_scene(folder: Path) -> Scene:
-    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation."""
+    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation.
+
+    Validation frames may be missing: nothing is learned from them.
+    """
     path = folder / "scene.json"
     if not folder.is_dir():
-        raise SceneError(f"{folder}: no such folder, expected a scene folder with scene.json in it")
+        what = "a file" if folder.exists() else "no such folder"
+        raise SceneError(f"{folder}: {what}, expected a scene folder with scene.json in it{did_you_mean(folder)}")
     content = _Object(path, "", _read_json(path))
     content.only(_KEYS.split())
     for key, expected in (("format", FORMAT), ("version", VERSION)):
         if content.get(key) != expected:
             raise SceneError(f"{path}: {key} is {content.get(key)!r}, expected {expected!r}")
     camera = _camera(content.object("camera"))
-    frames = content.optional_file("frames")
+    frames, missing = _read_frames(content.optional_file("frames", must_exist=False), camera)
     return Scene(
         folder=folder,
         # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
@@ -94,7 +100,8 @@ def read_scene(folder: Path) -> Scene:
         trajectory=content.file("trajectory"),
         camera=camera,
         groundtruth=content.optional_file("groundtruth"),
-        frames=_read_frames(frames, camera) if frames else (),
+        frames=frames,
+        missing=missing,
         contrast_threshold=_threshold(content.object("contrast_threshold"))
         if content.get("contrast_threshold") is not None
         else None,
@@ -134,7 +141,8 @@ def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajector
     if start_us > last_us or end_us < first_us:
         raise SceneError(
             f"{scene.events}: none of the events, {start_us} to {end_us} us, lies within the span of "
-            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}"
+            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}; ebarf process "
+            f"--time-offset-us {first_us - start_us} would let both begin together"
         )
     if among < 2 and last_us - first_us > _LONGEST_SPAN_RATIO * max(end_us - start_us, 1):
         raise SceneError(
@@ -243,11 +251,13 @@ class _Object:
             raise self.wrong(key, "a file name")
         path = self.path.parent / name
         if must_exist and not path.is_file():
-            raise SceneError(f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}")
+            raise SceneError(
+                f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}{did_you_mean(path)}"
+            )
         return path
 
-    def optional_file(self, key: str) -> Path | None:
-        return self.file(key) if self.get(key) is not None else None
+    def optional_file(self, key: str, must_exist: bool = True) -> Path | None:
+        return self.file(key, must_exist) if self.get(key) is not None else None
 
     def number(self, key: str, expected: str = "a finite number", positive: bool = False) -> float:
         value = self.get(key)
@@ -324,11 +334,18 @@ def _bounds(content: _Object) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def _read_frames(path: Path, event_camera: Camera) -> tuple[Frame, ...]:
+def _read_frames(path: Path | None, event_camera: Camera) -> tuple[tuple[Frame, ...], tuple[Path, ...]]:
+    """Those that are there, and the files that are not."""
+    if path is None or not path.exists():
+        return (), (path,) if path else ()
     content = _read_json(path)
     if not isinstance(content, list):
         raise SceneError(f"{path}: holds a {type(content).__name__}, expected a list of frames")
-    return tuple(_frame(_Object(path, f"[{k}]", item), event_camera) for k, item in enumerate(content))
+    frames = [_frame(_Object(path, f"[{k}]", item), event_camera) for k, item in enumerate(content)]
+    named = [file for frame in frames for file in (frame.path, frame.depth) if file]
+    missing = tuple(file for file in named if not file.is_file())
+    present = [frame for frame in frames if frame.path not in missing]
+    return tuple(replace(one, depth=None) if one.depth in missing else one for one in present), missing
 
 
 def _frame(content: _Object, event_camera: Camera) -> Frame:
@@ -339,10 +356,10 @@ def _frame(content: _Object, event_camera: Camera) -> Frame:
         if not rows or not all(len(row) == 4 and all(map(_is_number, row)) for row in extrinsic):
             raise content.wrong("event_camera_from_frame_camera", "a 4x4 matrix of numbers")
     return Frame(
-        path=content.file("file"),
+        path=content.file("file", must_exist=False),
         t_us=content.integer("t_us"),
         camera=_camera(content.object("camera")) if content.get("camera") is not None else event_camera,
         event_camera_from_frame_camera=tuple(tuple(map(float, row)) for row in extrinsic or np.eye(4).tolist()),
         intensity=content.choice("intensity", get_args(FrameIntensity)),
-        depth=content.optional_file("depth"),
+        depth=content.optional_file("depth", must_exist=False),
     )

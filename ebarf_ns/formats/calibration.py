@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.errors import SceneError
+from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.files import opened_npz
 from ebarf_ns.geometry.cameras import Camera, CameraModel
 
@@ -81,7 +81,8 @@ def read_cameras(path: Path, sensor_size: Size | None = None) -> dict[str, Calib
 def _cameras(path: Path, size: Size | None) -> dict[str, Callable[[], Calibrated]]:
     """What reads each camera: that one cannot be read does not matter to who wants another."""
     if not path.is_file():
-        raise SceneError(f"{path}: {'a folder' if path.is_dir() else 'no such file'}, expected a calibration file")
+        what = "a folder" if path.is_dir() else "no such file"
+        raise SceneError(f"{path}: {what}, expected a calibration file{did_you_mean(path)}")
     suffix = path.suffix.lower()
     if suffix == ".npz":
         return {"camera": lambda: _robust_e_nerf(path)}

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import torch
 
-from ebarf_ns.errors import RecordingError, SceneError, TrajectoryError
+from ebarf_ns.errors import RecordingError, SceneError, TrajectoryError, did_you_mean
 from ebarf_ns.evaluation.compare import read_beside_reference
-from ebarf_ns.files import whole_folder
+from ebarf_ns.files import read_picture, whole_folder, write_picture
 from ebarf_ns.formats.calibration import read_calibration
 from ebarf_ns.formats.intake import Intake, hot_pixels, take_in
 from ebarf_ns.formats.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
@@ -123,7 +123,7 @@ def _check(settings: ProcessSettings) -> None:
 @contextmanager
 def _unpacked(source: Path) -> Iterator[Path]:
     """The source, or what is in it where it is a zip file of a dataset."""
-    if source.suffix != ".zip":
+    if source.suffix != ".zip" or not source.exists():
         yield source
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -139,7 +139,7 @@ def _unpacked(source: Path) -> Iterator[Path]:
 
 def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
     if not source.exists():
-        raise SceneError(f"{source}: no such file or folder, expected a recording")
+        raise SceneError(f"{source}: no such file or folder, expected a recording{did_you_mean(source)}")
     layout = _layout(format, source)
     if layout:
         if not source.is_dir():
@@ -367,7 +367,7 @@ def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> F
     name = picture.stem if isinstance(picture, Path) else name
     as_it_is = isinstance(picture, Path) and picture.suffix.lower() == ".png"
     flag = cv2.IMREAD_UNCHANGED if as_it_is else cv2.IMREAD_GRAYSCALE
-    image = cv2.imread(str(picture), flag) if isinstance(picture, Path) else picture
+    image = read_picture(picture, flag) if isinstance(picture, Path) else picture
     if image is None:
         raise SceneError(f"{picture}: cannot be read as an image, expected one, or --no-frames")
     size, of = image.shape[1::-1], frame.camera or camera
@@ -378,6 +378,6 @@ def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> F
     if as_it_is:
         path.write_bytes(Path(picture).read_bytes())  # pyright: ignore[reportArgumentType]
     else:
-        cv2.imwrite(str(path), image)
+        write_picture(path, image)
     extrinsic = tuple(map(tuple, np.asarray(frame.event_camera_from_frame_camera, float).tolist()))
     return Frame(path, frame.t_us, of, extrinsic, frame.intensity)
