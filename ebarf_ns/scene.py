@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -13,8 +10,8 @@ import numpy as np
 import torch
 
 from ebarf_ns.errors import SceneError, did_you_mean
-from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
+from ebarf_ns.json_file import JsonObject, is_number, read_json, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -86,7 +83,7 @@ def read_scene(folder: Path) -> Scene:
     if not folder.is_dir():
         what = "a file" if folder.exists() else "no such folder"
         raise SceneError(f"{folder}: {what}, expected a scene folder with scene.json in it{did_you_mean(folder)}")
-    content = _Object(path, "", _read_json(path))
+    content = JsonObject(path, "", read_json(path))
     content.only(_KEYS.split())
     for key, expected in (("format", FORMAT), ("version", VERSION)):
         if content.get(key) != expected:
@@ -167,8 +164,8 @@ def write_scene(scene: Scene) -> None:
         "bounds": scene.bounds,
     }
     if scene.frames:
-        _write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
-    _write_json(scene.folder / "scene.json", content)
+        write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
+    write_json(scene.folder / "scene.json", content)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -178,7 +175,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_camera(path: Path, camera: Camera) -> None:
     """Write a camera as ``scene.json`` has it under "camera"."""
-    _write_json(path, _camera_json(camera))
+    write_json(path, _camera_json(camera))
 
 
 def _camera_json(camera: Camera) -> dict[str, Any]:
@@ -200,94 +197,12 @@ def _frame_json(frame: Frame, scene: Scene) -> dict[str, Any]:
     return content
 
 
-def _write_json(path: Path, content: object) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise SceneError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: byte {error.start} is not UTF-8 text") from None
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise SceneError(f"{path}: not valid JSON ({error})") from None
-
-
-class _Object:
-    """A JSON object that knows where it stands, so that every complaint names file and key."""
-
-    def __init__(self, path: Path, place: str, content: object):
-        if not isinstance(content, Mapping):
-            raise SceneError(f"{path}: {place or 'the file'} is {content!r:.40}, expected a JSON object")
-        self.path, self.place, self.content = path, place, content
-
-    def name(self, key: str) -> str:
-        return f"{self.place}.{key}" if self.place else key
-
-    def get(self, key: str) -> Any:
-        return self.content.get(key)
-
-    def only(self, keys: Sequence[str]) -> None:
-        unknown = [key for key in self.content if key not in keys]
-        if unknown:
-            names = ", ".join(self.name(key) for key in unknown)
-            raise SceneError(f"{self.path}: unknown key {names}, expected among: {', '.join(keys)}")
-
-    def wrong(self, key: str, expected: str) -> SceneError:
-        found = repr(self.content[key]) if key in self.content else "missing"
-        return SceneError(f"{self.path}: {self.name(key)} is {found:.80}, expected {expected}")
-
-    def object(self, key: str) -> "_Object":
-        if not isinstance(self.get(key), Mapping):
-            raise self.wrong(key, "a JSON object")
-        return _Object(self.path, self.name(key), self.get(key))
-
-    def file(self, key: str, must_exist: bool = True) -> Path:
-        name = self.get(key)
-        if not isinstance(name, str) or not name:
-            raise self.wrong(key, "a file name")
-        path = self.path.parent / name
-        if must_exist and not path.is_file():
-            raise SceneError(
-                f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}{did_you_mean(path)}"
-            )
-        return path
-
-    def optional_file(self, key: str, must_exist: bool = True) -> Path | None:
-        return self.file(key, must_exist) if self.get(key) is not None else None
-
-    def number(self, key: str, expected: str = "a finite number", positive: bool = False) -> float:
-        value = self.get(key)
-        if not _is_number(value) or (positive and value <= 0):
-            raise self.wrong(key, f"{expected} above 0" if positive else expected)
-        return float(value)
-
-    def integer(self, key: str, positive: bool = False) -> int:
-        value = self.get(key)
-        if not isinstance(value, int) or isinstance(value, bool) or (positive and value <= 0):
-            raise self.wrong(key, "an integer above 0" if positive else "an integer")
-        return value
-
-    def choice(self, key: str, choices: tuple[str, ...]) -> Any:
-        if self.get(key) not in choices:
-            raise self.wrong(key, f"one of {', '.join(choices)}")
-        return self.get(key)
-
-
-def _is_number(value: object) -> bool:
-    # Comparing is safe for integers of any length, which do not fit a float.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-def _camera(content: _Object) -> Camera:
+def _camera(content: JsonObject) -> Camera:
     content.only("model width height fx fy cx cy distortion".split())
     model = content.choice("model", tuple(COEFFICIENTS))
     distortion = content.get("distortion") or []
     counts = COEFFICIENTS[model]
-    if not isinstance(distortion, list) or len(distortion) not in counts or not all(map(_is_number, distortion)):
+    if not isinstance(distortion, list) or len(distortion) not in counts or not all(map(is_number, distortion)):
         raise content.wrong("distortion", f"a list of {' or '.join(map(str, counts))} numbers for model {model}")
     return Camera(
         model=model,
@@ -301,33 +216,33 @@ def _camera(content: _Object) -> Camera:
     )
 
 
-def _threshold(content: _Object) -> ContrastThreshold:
+def _threshold(content: JsonObject) -> ContrastThreshold:
     content.only(["on", "off"])
     return ContrastThreshold(content.number("on", positive=True), content.number("off", positive=True))
 
 
-def _refractory_us(content: _Object) -> int:
+def _refractory_us(content: JsonObject) -> int:
     value = content.integer("refractory_us")
     if not 0 <= value <= _LONGEST_REFRACTORY_US:
         raise content.wrong("refractory_us", f"whole microseconds from 0 to {_LONGEST_REFRACTORY_US}")
     return value
 
 
-def _time_constant_us(content: _Object) -> float:
+def _time_constant_us(content: JsonObject) -> float:
     value = content.number("time_constant_us")
     if not 0 <= value <= _LONGEST_TIME_CONSTANT_US:
         raise content.wrong("time_constant_us", f"microseconds from 0 to {_LONGEST_TIME_CONSTANT_US}")
     return value
 
 
-def _bounds(content: _Object) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _bounds(content: JsonObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
     bounds = content.get("bounds")
     expected = "two corners [[x, y, z], [x, y, z]], the first below the second on every axis"
     if not isinstance(bounds, list) or len(bounds) != 2:
         raise content.wrong("bounds", expected)
     lower, upper = bounds
     for corner in bounds:
-        if not isinstance(corner, list) or len(corner) != 3 or not all(map(_is_number, corner)):
+        if not isinstance(corner, list) or len(corner) != 3 or not all(map(is_number, corner)):
             raise content.wrong("bounds", expected)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise content.wrong("bounds", expected)
@@ -338,22 +253,22 @@ def _read_frames(path: Path | None, event_camera: Camera) -> tuple[tuple[Frame, 
     """Those that are there, and the files that are not."""
     if path is None or not path.exists():
         return (), (path,) if path else ()
-    content = _read_json(path)
+    content = read_json(path)
     if not isinstance(content, list):
         raise SceneError(f"{path}: holds a {type(content).__name__}, expected a list of frames")
-    frames = [_frame(_Object(path, f"[{k}]", item), event_camera) for k, item in enumerate(content)]
+    frames = [_frame(JsonObject(path, f"[{k}]", item), event_camera) for k, item in enumerate(content)]
     named = [file for frame in frames for file in (frame.path, frame.depth) if file]
     missing = tuple(file for file in named if not file.is_file())
     present = [frame for frame in frames if frame.path not in missing]
     return tuple(replace(one, depth=None) if one.depth in missing else one for one in present), missing
 
 
-def _frame(content: _Object, event_camera: Camera) -> Frame:
+def _frame(content: JsonObject, event_camera: Camera) -> Frame:
     content.only("file t_us camera event_camera_from_frame_camera intensity depth".split())
     extrinsic = content.get("event_camera_from_frame_camera")
     if extrinsic is not None:
         rows = isinstance(extrinsic, list) and len(extrinsic) == 4 and all(isinstance(row, list) for row in extrinsic)
-        if not rows or not all(len(row) == 4 and all(map(_is_number, row)) for row in extrinsic):
+        if not rows or not all(len(row) == 4 and all(map(is_number, row)) for row in extrinsic):
             raise content.wrong("event_camera_from_frame_camera", "a 4x4 matrix of numbers")
     return Frame(
         path=content.file("file", must_exist=False),
