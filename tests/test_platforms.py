@@ -1,7 +1,6 @@
-"""What holds the package together with other systems than the one that tests it: paths, line ends, no Linux-only calls."""
+"""Other systems than the one that tests: paths, line ends, no calls that only Linux has."""
 
 import ast
-import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from ebarf_ns import memory
-from ebarf_ns.events import pairs
 from ebarf_ns.events.recording import read_recording
 from ebarf_ns.files import read_picture, write_picture
 from ebarf_ns.geometry.trajectory_file import read_tum
@@ -97,13 +95,6 @@ def test_memory_is_not_known_where_the_system_does_not_tell(monkeypatch: pytest.
         assert memory.peak_memory_mib() > 50
     monkeypatch.setattr(memory, "resource", None)
     assert memory.peak_memory_mib() == 0
-
-
-def test_an_index_on_disk_needs_no_posix_fallocate(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delattr(os, "posix_fallocate", raising=False)
-    index = pairs._file_backed(1000)
-    index[:] = np.zeros(1000, index.dtype)
-    assert len(index) == 1000 and isinstance(index, np.memmap)
 
 
 def test_folders_with_spaces_and_letters_beyond_ascii(tmp_path: Path):
