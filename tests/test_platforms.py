@@ -112,7 +112,7 @@ def test_folders_with_spaces_and_letters_beyond_ascii(tmp_path: Path):
     assert pixels is not None and (pixels == 7).all()
     run_ok("ebarf", "inspect", source / "events.txt", "--picture", folder / "bögen.png")
     sheet = read_picture(folder / "bögen.png")
-    assert sheet is not None and sheet.shape[0] > 100
+    assert sheet is not None and sheet.ndim == 2
 
 
 def crlf(folder: Path) -> None:

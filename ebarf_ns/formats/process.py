@@ -18,6 +18,7 @@ import torch
 
 from ebarf_ns.errors import SceneError, TrajectoryError, did_you_mean
 from ebarf_ns.evaluation.compare import read_beside_reference
+from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
 from ebarf_ns.files import read_picture, whole_folder, write_picture
 from ebarf_ns.formats.calibration import read_calibration
 from ebarf_ns.formats.intake import Intake, hot_pixels, take_in
@@ -26,7 +27,7 @@ from ebarf_ns.formats.recognise import RecordingFormat, open_recording, recognis
 from ebarf_ns.formats.source import Source, TimeUnit
 from ebarf_ns.formats.trajectory_beside_events import apart, clipped, doubts
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
-from ebarf_ns.geometry.cameras import Camera
+from ebarf_ns.geometry.cameras import Camera, Crop, cropped
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import write_tum
@@ -202,6 +203,15 @@ def _assemble(
     source = ingredients.open_events()
     camera, notes = _camera(ingredients, settings, source.sensor_size), list(ingredients.notes)
     size, intake = (camera.width, camera.height), settings.events
+    whole = camera
+    if intake.crop:
+        left, top, right, bottom = intake.crop
+        if not (0 <= left < right <= camera.width and 0 <= top < bottom <= camera.height):
+            raise SceneError(
+                f"--crop is {left} {top} {right} {bottom}, expected X0 Y0 X1 Y1 with 0 <= X0 < X1 <= {camera.width} "
+                f"and 0 <= Y0 < Y1 <= {camera.height}"
+            )
+        camera = cropped(camera, intake.crop)
     hot = hot_pixels(source, size, intake, intake.hot_pixels) if intake.hot_pixels is not None else None
     source = ingredients.open_events() if hot is not None else source
     report = take_in(source, size, intake, folder / "events.h5", hot, progress)
@@ -235,7 +245,7 @@ def _assemble(
         frame = replace(frame, t_us=frame.t_us + intake.time_offset_us)  # noqa: PLW2901
         if span_us[0] <= frame.t_us <= span_us[1]:
             within += 1
-            taken = _taken_along(frame, f"{seen:06d}", camera, folder)
+            taken = _taken_along(frame, f"{seen:06d}", whole, intake.crop, folder)
             if isinstance(taken, Frame):
                 frames.append(taken)
             else:
@@ -253,6 +263,8 @@ def _assemble(
         bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
     )
     write_scene(scene)
+    contradicted = polarity_contradicted(polarity_correlations(scene))
+    notes += [f"suspicious: {contradicted}"] if contradicted else []
     taken_along = "" if len(frames) == within else f", {len(frames)} of which are taken along"
     notes.append(
         f"{len(initial.t_us)} keyframes around the events, {within} of {seen} frames within their span{taken_along}"
@@ -299,21 +311,28 @@ def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tupl
     return tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
 
 
-def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> Frame | str:
-    """A copy: PNG where the scene can hold it as it is; of what size a frame is that its camera cannot have taken."""
+def _taken_along(frame: FrameFile, name: str, camera: Camera, crop: Crop | None, folder: Path) -> Frame | str:
+    """A copy: PNG where the scene can hold it as it is; of what size a frame is that its camera cannot have taken.
+
+    Frames of the event camera itself are cropped with it.
+    """
+    crop = crop if frame.camera is None else None
     picture = frame.picture
     name = picture.stem if isinstance(picture, Path) else name
-    as_it_is = isinstance(picture, Path) and picture.suffix.lower() == ".png"
-    flag = cv2.IMREAD_UNCHANGED if as_it_is else cv2.IMREAD_GRAYSCALE
+    is_png = isinstance(picture, Path) and picture.suffix.lower() == ".png"
+    flag = cv2.IMREAD_UNCHANGED if is_png else cv2.IMREAD_GRAYSCALE
     image = read_picture(picture, flag) if isinstance(picture, Path) else picture
     if image is None:
         raise SceneError(f"{picture}: cannot be read as an image, expected one, or --no-frames")
     size, of = image.shape[1::-1], frame.camera or camera
     if size != (of.width, of.height):
         return f"{size[0]} x {size[1]} pixels, expected their camera's {of.width} x {of.height}"
+    if crop:
+        of = cropped(of, crop)
+        image = image[crop[1] : crop[3], crop[0] : crop[2]]
     path = folder / "frames" / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
-    if as_it_is:
+    if is_png and crop is None:
         path.write_bytes(Path(picture).read_bytes())  # pyright: ignore[reportArgumentType]
     else:
         write_picture(path, image)
