@@ -17,8 +17,8 @@ from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.plan import Line, plan_for
+from ebarf_ns.printing import print_facts, print_line
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
-from ebarf_ns.terminal import print_facts, print_line
 
 _FEW_EVENTS_PER_PIXEL = 5
 

@@ -10,7 +10,7 @@ from ebarf_ns.errors import RecordingError
 from ebarf_ns.files import whole_file, write_picture
 from ebarf_ns.formats.intake import far_busier
 from ebarf_ns.formats.source import Piece, Source
-from ebarf_ns.terminal import print_facts
+from ebarf_ns.printing import print_facts
 
 _LARGEST_SENSOR = 8192
 _SLOT_US = 100_000

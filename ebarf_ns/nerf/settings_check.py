@@ -76,7 +76,7 @@ def check_settings(config: TrainerConfig) -> None:
         )
 
 
-def _check_scene_is_named(config: EbarfTrainerConfig) -> None:
+def _check_scene_is_named(config: TrainerConfig) -> None:
     datamanager: Any = config.pipeline.datamanager
     if datamanager.data is None and datamanager.dataparser.data == type(datamanager.dataparser).data:
         raise TrainingError("no --data given, expected ns-train ebarf --data SCENE")
