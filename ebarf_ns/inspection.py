@@ -163,7 +163,8 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     found.extend(torn(trajectory))
     if scene.bounds is None:
         found.append(
-            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail"
+            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail; where "
+            "you know how far away the farthest thing is, ebarf process has --farthest"
         )
     return found
 
