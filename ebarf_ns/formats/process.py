@@ -278,8 +278,8 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
         camera = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said).camera
     if camera is None:
         raise SceneError(
-            "no calibration with the recording, expected --camera with a file that has one: of kalibr, ROS, OpenCV, EuRoC, "
-            "VINS, ORB-SLAM, DV, basalt, a scene.json, or a line of fx fy cx cy and distortion"
+            "no calibration with the recording, expected --camera with a file that has one: of kalibr, ROS, OpenCV, "
+            "EuRoC, VINS, ORB-SLAM, DV, basalt, a scene.json, or a line of fx fy cx cy and distortion"
         )
     if said is not None and said != (camera.width, camera.height):
         raise SceneError(
