@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.errors import SceneError
+from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.files import opened_npz
 from ebarf_ns.formats.camera_entry import INTRINSICS, Size, camera_of, matrix_of
 from ebarf_ns.formats.named_values import KNOWN_LAYOUTS, Entry, numbers_of, parsed, plain, shown, text_of
@@ -53,7 +53,8 @@ def read_cameras(path: Path, sensor_size: Size | None = None) -> dict[str, Calib
 def _cameras(path: Path, size: Size | None) -> dict[str, Callable[[], Calibrated]]:
     """What reads each camera: that one cannot be read does not matter to who wants another."""
     if not path.is_file():
-        raise SceneError(f"{path}: {'a folder' if path.is_dir() else 'no such file'}, expected a calibration file")
+        what = "a folder" if path.is_dir() else "no such file"
+        raise SceneError(f"{path}: {what}, expected a calibration file{did_you_mean(path)}")
     suffix = path.suffix.lower()
     if suffix == ".npz":
         return {"camera": lambda: _robust_e_nerf(path)}

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 import torch
 
-from ebarf_ns.errors import SceneError, TrajectoryError
+from ebarf_ns.errors import SceneError, TrajectoryError, did_you_mean
 from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
-from ebarf_ns.files import whole_folder
+from ebarf_ns.files import read_picture, whole_folder, write_picture
 from ebarf_ns.formats.calibration import read_calibration
 from ebarf_ns.formats.intake import Intake, hot_pixels, take_in
 from ebarf_ns.formats.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
@@ -122,7 +122,7 @@ def _check(settings: ProcessSettings) -> None:
 @contextmanager
 def _unpacked(source: Path) -> Iterator[Path]:
     """The source, or what is in it where it is a zip file of a dataset."""
-    if source.suffix != ".zip":
+    if source.suffix != ".zip" or not source.exists():
         yield source
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -138,7 +138,7 @@ def _unpacked(source: Path) -> Iterator[Path]:
 
 def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
     if not source.exists():
-        raise SceneError(f"{source}: no such file or folder, expected a recording")
+        raise SceneError(f"{source}: no such file or folder, expected a recording{did_you_mean(source)}")
     layout = _layout(format, source)
     if layout:
         if not source.is_dir():
@@ -277,7 +277,10 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
     if settings.camera and camera is None:
         camera = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said).camera
     if camera is None:
-        raise SceneError("no calibration with the recording, expected --camera with a file that has one")
+        raise SceneError(
+            "no calibration with the recording, expected --camera with a file that has one: of kalibr, ROS, OpenCV, "
+            "EuRoC, VINS, ORB-SLAM, DV, basalt, a scene.json, or a line of fx fy cx cy and distortion"
+        )
     if said is not None and said != (camera.width, camera.height):
         raise SceneError(
             f"the recording says its sensor has {said[0]} x {said[1]} pixels, the calibration {camera.width} x "
@@ -321,7 +324,7 @@ def _taken_along(frame: FrameFile, name: str, camera: Camera, crop: Crop | None,
     name = picture.stem if isinstance(picture, Path) else name
     is_png = isinstance(picture, Path) and picture.suffix.lower() == ".png"
     flag = cv2.IMREAD_UNCHANGED if is_png else cv2.IMREAD_GRAYSCALE
-    image = cv2.imread(str(picture), flag) if isinstance(picture, Path) else picture
+    image = read_picture(picture, flag) if isinstance(picture, Path) else picture
     if image is None:
         raise SceneError(f"{picture}: cannot be read as an image, expected one, or --no-frames")
     size, of = image.shape[1::-1], frame.camera or camera
@@ -335,6 +338,6 @@ def _taken_along(frame: FrameFile, name: str, camera: Camera, crop: Crop | None,
     if is_png and crop is None:
         path.write_bytes(Path(picture).read_bytes())  # pyright: ignore[reportArgumentType]
     else:
-        cv2.imwrite(str(path), image)
+        write_picture(path, image)
     extrinsic = tuple(map(tuple, np.asarray(frame.event_camera_from_frame_camera, float).tolist()))
     return Frame(path, frame.t_us, of, extrinsic, frame.intensity)

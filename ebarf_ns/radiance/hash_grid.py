@@ -7,6 +7,7 @@ The lattice and the table's order are tiny-cuda-nn's, so that a trained table me
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Literal
@@ -68,21 +69,34 @@ def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
     if point.dtype == torch.float32 and point.device.type == "cpu":
         return "numba"
     if point.dtype == torch.float32 and point.is_cuda:
-        return "tcnn" if _importable("tinycudann") else "triton" if _importable("triton") else "torch"
+        if not why_not("tinycudann"):
+            return "tcnn"
+        if not why_not("triton"):
+            return "triton"
+        _say_slow()
     return "torch"
 
 
 @lru_cache
-def _importable(name: str) -> bool:
-    """Whether it is there and fits this machine: tiny-cuda-nn raises errors of its own on GPUs it was not built for,
-    and Triton's driver is compiled when it is first asked."""
+def why_not(name: str) -> str:
+    """Why a library is not made use of, empty where it is: tiny-cuda-nn raises errors of its own on GPUs it was not
+    built for, and Triton's driver is compiled when it is first asked."""
     try:
         module = import_module(name)
         if name == "triton":
             module.runtime.driver.active.get_current_device()
-    except Exception:
-        return False
-    return True
+    except Exception as error:
+        return " ".join(str(error).split()) or type(error).__name__
+    return ""
+
+
+@lru_cache
+def _say_slow() -> None:
+    """Once: whoever waits should know what for."""
+    sys.stderr.write(
+        "the hash grid runs in plain torch on this GPU, about 200 times slower, for want of Triton "
+        f"({why_not('triton'):.120}) and tiny-cuda-nn ({why_not('tinycudann'):.120})\n"
+    )
 
 
 _encodings: dict[HashGridShape, nn.Module] = {}
