@@ -18,15 +18,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from ebarf_ns.errors import RecordingError, one_line_errors
-from ebarf_ns.events.pairs import (
-    DrawAhead,
-    EventPairs,
-    HeldoutBlocks,
-    PairIndex,
-    batch_random,
-    index_pairs,
-    joined,
-)
+from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import EventPairs, PairIndex, joined
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import SensorFacts, identify
 from ebarf_ns.events.timing import clock_step_us, flicker_hz

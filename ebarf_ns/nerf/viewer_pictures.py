@@ -12,8 +12,7 @@ import torch
 
 from ebarf_ns.errors import EbarfError
 from ebarf_ns.evaluation.frames import read_frame
-from ebarf_ns.events.pairs import accumulate
-from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.recording import RecordingFile, accumulate
 from ebarf_ns.nerf.views import for_people
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from torch import Tensor
 
 from ebarf_ns.errors import EbarfError
-from ebarf_ns.events.pairs import accumulate
-from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.recording import RecordingFile, accumulate
 from ebarf_ns.scene import Scene
 
 # Of the sine between view and vertical; a spiral's views turn by the hundredth part of a degree against each other.
