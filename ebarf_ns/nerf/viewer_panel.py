@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ebarf_ns.nerf.pipeline import EbarfPipeline
 
 # A chore that took a second comes again after so many.
-_REST, _LEAST_REST_S = 30.0, 1.0
+_REST, _LEAST_REST_S = 50.0, 1.0
 _MOST_RECORDS = 400
 _CPU_MAX_RES = 256
 
