@@ -87,6 +87,10 @@ def opened(*command: object) -> Iterator[Visit]:
             visit.page.set_default_timeout(1000 * PATIENCE_S)
             visit.page.goto(f"http://127.0.0.1:{port}")
             visit.page.get_by_text("Event camera").wait_for()
+            # A page opened while nerfstudio was still building its own has asked for its logo.
+            visit.outside.clear()
+            visit.page.reload()
+            visit.page.get_by_text("Event camera").wait_for()
             wait_until(lambda: len(visit.pictures()) == 2)
             yield visit
             browser.close()
