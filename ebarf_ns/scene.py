@@ -214,7 +214,7 @@ def _camera(content: CheckedObject) -> Camera:
         """A number of pixels that makes sense beside those of the sensor."""
         value, most = content.number(key, positive=positive), _MOST_SIDES * max(width, height)
         if abs(value) > most or (positive and value < 1 / _MOST_SIDES):
-            raise content.wrong(key, f"{f'{1 / _MOST_SIDES} to' if positive else 'within ±'}{most:.6g} pixels")
+            raise content.wrong(key, f"{f'{1 / _MOST_SIDES} to ' if positive else 'within ±'}{most:.6g} pixels")
         return value
 
     return Camera(
@@ -232,7 +232,7 @@ def _camera(content: CheckedObject) -> Camera:
 def _threshold(content: CheckedObject) -> ContrastThreshold:
     content.only(["on", "off"])
     for key in ("on", "off"):
-        if not 1 / _MOST_THRESHOLD <= content.number(key) <= _MOST_THRESHOLD:
+        if not 1 / _MOST_THRESHOLD <= content.number(key, positive=True) <= _MOST_THRESHOLD:
             raise content.wrong(key, f"a number from {1 / _MOST_THRESHOLD:g} to {_MOST_THRESHOLD:g}")
     return ContrastThreshold(content.number("on"), content.number("off"))
 

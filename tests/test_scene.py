@@ -73,7 +73,7 @@ def camera(**changes: object) -> dict:
         (camera(fx=1e300), "camera.fx is 1e+300, expected 0.0001 to"),
         (camera(cx=-1e300), "camera.cx is -1e+300, expected within ±"),
         (changed(bounds=[[-1e308] * 3, [1e308] * 3]), "on every axis, within ±1e+09"),
-        (changed(contrast_threshold={"on": 1e300, "off": 0.2}), "contrast_threshold.on is 1e+300, expected a number from"),
+        (changed(contrast_threshold={"on": 1e300, "off": 0.2}), "on is 1e+300, expected a number from"),
         (changed(evnets="x"), "unknown key evnets"),
         (changed(trajectory="gone.txt"), "trajectory names 'gone.txt', but there is no file"),
         (changed(events=3), "events is 3, expected a file name"),
