@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events import intake as intake_module
 from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.formats import intake as intake_module
 from ebarf_ns.formats.intake import Intake, IntakeReport, hot_pixels, take_in
 from ebarf_ns.formats.source import Piece, Source, numbered
 from tests.formats import writers
