@@ -76,9 +76,14 @@ class EbarfPipeline(VanillaPipeline):
     def _mount_scale(self) -> float:
         return self.datamanager.train_dataset.metadata["mount_scale"]
 
+    @property
+    def seed(self) -> int:
+        """Of this process among those that train together."""
+        return self.datamanager.config.seed * self.world_size + self.datamanager.rank
+
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
-        self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.rank)
+        self.model.begin_step(step, self.seed)
         return super().get_train_loss_dict(step)
 
     def trajectory(self, refined: bool = True) -> Trajectory:

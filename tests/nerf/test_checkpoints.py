@@ -137,14 +137,14 @@ def test_a_signal_ends_a_run_whole(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: int
 ):
     ready = trainer(config(tiny_scene, tmp_path, steps=1000))
-    step_done = type(ready)._average
+    step_done = ready.averaging.follow
 
-    def interrupted(training) -> None:
-        step_done(training)
-        if training.steps_done == 3:
+    def interrupted(steps_done: int) -> None:
+        step_done(steps_done)
+        if steps_done == 3:
             os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(type(ready), "_average", interrupted)
+    monkeypatch.setattr(ready.averaging, "follow", interrupted)
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as stopped:
         ready.train()
@@ -187,7 +187,7 @@ def test_a_parameter_that_is_not_finite_is_never_saved(tiny_scene: Path, tmp_pat
     before = {path: path.read_bytes() for path in ready.checkpoint_dir.iterdir()}
     ready.steps_done = 3
     with torch.no_grad():
-        ready._parameters()[0].view(-1)[0] = torch.nan
-    ready.mean = None
+        ready.averaging.parameters[0].view(-1)[0] = torch.nan
+    ready.averaging.mean = None
     ready.save_checkpoint(2)
     assert {path: path.read_bytes() for path in ready.checkpoint_dir.iterdir()} == before

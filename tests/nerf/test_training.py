@@ -12,7 +12,8 @@ import torch
 
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf import method
-from ebarf_ns.nerf.optimizers import FusedAdamConfig, GuardedOptimizers
+from ebarf_ns.nerf.guard import GuardedOptimizers
+from ebarf_ns.nerf.optimizers import FusedAdamConfig
 from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig
 from ebarf_ns.simulation.sensor import SensorModel
 from ebarf_ns.simulation.simulate import Simulation, simulate
