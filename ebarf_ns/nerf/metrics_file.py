@@ -54,6 +54,15 @@ def scene_digest(scene: Scene) -> dict[str, str]:
     return {**digests, "events": events.hexdigest()[:16]}
 
 
+def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
+    """What of a scene is not as it was for the run with this header; empty too where the run did not say."""
+    before = header.get("scene_digest")
+    if not isinstance(before, dict):
+        return []
+    now = scene_digest(scene)
+    return [part for part in now if before.get(part) != now[part]]
+
+
 def flags_of(configuration: Any) -> dict[str, Any]:
     """The settings of a run by the names of their flags, in plain values; not those that say where it lies."""
     return {name: value for name, value in _flags(configuration) if name.split(".")[-1] not in _PLACES}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
-from torch import Tensor
+from torch import Tensor, nn
 
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.geometry.cameras import Camera
@@ -107,8 +107,14 @@ def replay(path: Path) -> Replayed:
 
 def _do_again(model: EbarfModel, rays: RayBundle, content: dict[str, Any]) -> Replayed:
     not_finite: list[str] = []
-    for name, module in model.named_modules():
-        module.register_forward_hook(lambda _, __, output, name=name: _all_finite(output) or not_finite.append(name))
+    names = {module: name or "the model" for name, module in model.named_modules()}
+
+    def look(module: nn.Module, _: Any, output: Any) -> None:
+        if not all(bool(tensor.isfinite().all()) for tensor in _tensors(output)):
+            not_finite.append(names[module])
+
+    for module in names:
+        module.register_forward_hook(look)
     model.train()
     model.begin_step(content["step"], content["seed"])
     bad = [name for name, one in model.named_parameters() if not bool(one.isfinite().all())]
@@ -138,7 +144,7 @@ def _do_again(model: EbarfModel, rays: RayBundle, content: dict[str, Any]) -> Re
         rays=len(rays),
         losses={name: float(value.detach()) for name, value in losses.items()},
         parameters_not_finite=bad,
-        outputs_not_finite=list(dict.fromkeys(name or "the model" for name in not_finite)),
+        outputs_not_finite=list(dict.fromkeys(not_finite)),
         gradients_not_finite=[name for name, one in gradients.items() if not bool(one.isfinite().all())],
         gradients_beyond_usual={name: ratio for name, ratio in ratios.items() if ratio > 10},
         anomaly=anomaly,
@@ -176,10 +182,6 @@ def _plain(config: Any) -> dict[str, Any]:
 
 def _name(model: EbarfModel, parameter: Tensor) -> str:
     return next(name for name, one in model.named_parameters() if one is parameter)
-
-
-def _all_finite(value: Any) -> bool:
-    return all(bool(tensor.isfinite().all()) for tensor in _tensors(value))
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:

@@ -17,7 +17,7 @@ from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.dataparser import keep_scene, moved
-from ebarf_ns.nerf.metrics_file import config_digest, flags_of, scene_digest
+from ebarf_ns.nerf.metrics_file import changed_parts, config_digest, flags_of, scene_digest
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
 from ebarf_ns.scene import Scene, check_bounds, read_scene
@@ -45,15 +45,6 @@ def check_scene_is_the_same(scene: Scene, header: dict[str, Any], checkpoint: Pa
             f"{scene.folder}: {', '.join(changed)} changed since {checkpoint} was made; expected the scene that it was "
             "trained on, or --allow-changed-scene True"
         )
-
-
-def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
-    """What of a scene is not as it was for the run with this header; empty too where the run did not say."""
-    before = header.get("scene_digest")
-    if not isinstance(before, dict):
-        return []
-    now = scene_digest(scene)
-    return [part for part in now if before.get(part) != now[part]]
 
 
 def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str, Any]) -> list[Line]:

@@ -199,7 +199,6 @@ class EbarfTrainer(Trainer):
     def _write_report(self) -> None:
         write_report(self.base_dir, self.pipeline.scene.groundtruth)
 
-    @check_main_thread
     def _train_complete_viewer(self) -> None:
         with self.averaging.shown():
             super()._train_complete_viewer()
@@ -293,13 +292,14 @@ class EbarfTrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write the checkpoint whole, then remove all others but the one before; the step is the last one done."""
-        path = self._checkpoint_path()
+        last = max(self.steps_done - 1, 0)
+        path = self.checkpoint_dir / f"step-{last:09d}.ckpt"
         if self.saved_step == self.steps_done and path.is_file():
             return
         with self.averaging.shown():
             pipeline = {name: value.clone() for name, value in self.pipeline.state_dict().items()}
         state = {
-            "step": self._last_step(),
+            "step": last,
             "pipeline": pipeline,
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
@@ -317,12 +317,6 @@ class EbarfTrainer(Trainer):
             return
         write_checkpoint(state, path)
         self.saved_step = self.steps_done
-
-    def _last_step(self) -> int:
-        return max(self.steps_done - 1, 0)
-
-    def _checkpoint_path(self) -> Path:
-        return self.checkpoint_dir / f"step-{self._last_step():09d}.ckpt"
 
     def _load_checkpoint(self) -> None:
         path = self._loaded_path
