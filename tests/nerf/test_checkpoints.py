@@ -160,7 +160,7 @@ def test_a_signal_in_any_phase_ends_a_run_in_order(
 
     place, name = {
         "plan": (room, "plan_run"),
-        "compile": (model.EbarfModel, "get_loss_dict"),
+        "compile": (room.EbarfPipeline, "get_train_loss_dict"),
         "alignment": (room, "align"),
         "evaluation": (room.EbarfPipeline, "evaluate"),
         "saving": (room, "write_checkpoint"),
