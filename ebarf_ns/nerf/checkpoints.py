@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ebarf_ns.errors import TrainingError
-from ebarf_ns.files import synced, whole_file
+from ebarf_ns.files import is_special, synced, whole_file
 
 FORMAT = 1
 _KEPT = 2
@@ -53,6 +53,8 @@ def write_plain(content: dict[str, Any], path: Path) -> None:
 def read_plain(path: Path, what: str) -> dict[str, Any]:
     """What :func:`write_plain` wrote, on the processor, and nothing that would run code; raises :class:`TrainingError`
     that says what it should be."""
+    if is_special(path):
+        raise TrainingError(f"{path}: a pipe or a device, expected a run's {what}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         return {**content}
