@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.pairs import EVENT, PairIndex, counting
 from ebarf_ns.events.pixels import dead_pixels, hot_pixels

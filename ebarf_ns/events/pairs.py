@@ -14,7 +14,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int64, Shaped

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import is_special, whole_file
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int8, Int64, UInt8, UInt16
@@ -111,6 +111,8 @@ class RecordingFile:
     @contextmanager
     def _columns(self) -> Iterator[tuple[dict[str, h5py.Dataset], int]]:
         path = self.path
+        if is_special(path):
+            raise RecordingError(f"{path}: a pipe or a device, expected a file")
         try:
             with h5py.File(path, "r") as file:
                 columns = {name: self._column(file, name) for name in ("x", "y", "t", "p")}

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.events.pairs import PairIndex, missed_after

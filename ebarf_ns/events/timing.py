@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import welch
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64, Shaped

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.events.recording import Recording, joined, write_recording
 from ebarf_ns.formats.event_checks import MAX_TIME_US, check_order, check_polarity, check_values, late, unwrapped
 from ebarf_ns.formats.source import Source

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from collections.abc import Callable

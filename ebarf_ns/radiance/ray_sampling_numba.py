@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.radiance.hash_grid_numba import _FAST
 
 if TYPE_CHECKING:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import prange
+
+from ebarf_ns.compiled import njit
 
 _TINY = 1e-200
 

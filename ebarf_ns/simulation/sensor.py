@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
-from numba import njit
+
+from ebarf_ns.compiled import njit
 
 _NARROWEST, _WIDEST = 0.1, 3.0
 """Bounds of a bandwidth that follows the light, over ``cutoff_hz``."""

@@ -7,9 +7,10 @@ from typing import Protocol
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from numba import njit, prange
+from numba import prange
 from scipy.spatial.transform import Rotation
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.simulation.motion import Motion
 

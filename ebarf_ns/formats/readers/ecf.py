@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from jaxtyping import Int64, UInt8, UInt16

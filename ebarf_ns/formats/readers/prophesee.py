@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import IO, Literal
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.formats.source import Piece, Source, numbered
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
 from ebarf_ns.formats.source import DECIMALS, Piece, Source, TimeUnit
