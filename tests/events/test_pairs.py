@@ -23,7 +23,7 @@ def recording(seed: int, count: int) -> Recording:
 
 
 def index_of(events: Recording, chunk: int = 50, memory_bytes: int = 1 << 40) -> PairIndex:
-    """Built from pieces of ``chunk`` events."""
+    """Index built from pieces of ``chunk`` events."""
     pieces = [events.select(slice(k, k + chunk)) for k in range(0, len(events), chunk)]
     return index_pairs(lambda: pieces, WIDTH, HEIGHT, memory_bytes)
 
@@ -68,7 +68,7 @@ def test_every_silent_pair_is_what_the_stream_says(seed: int, count: int, longes
     ):
         rows = [row for row in truth.get(int(pixel), []) if events.t_us[row] <= t1]
         if not rows:
-            # Silent from the beginning: nothing has happened between any two moments.
+            # Silent from the beginning: no change between any two times.
             assert number == total == 0 and 0 <= t0 <= t1
             continue
         begin = len(rows) - 1 - int(number)
@@ -83,7 +83,7 @@ def test_silent_pairs_end_at_any_time_and_at_every_pixel_whether_it_ever_fires_o
     assert set(pairs.pixel.tolist()) == set(range(WIDTH * HEIGHT))
     never = ~np.isin(pairs.pixel, list(by_pixel(events)))
     assert never.any() and (pairs.event_count[never] == 0).all() and (pairs.duration_us[never] > 1000).any()
-    # After the last event of all, every time is as likely as any other.
+    # Times after the last event of all are uniform.
     late = pairs.t1_us[pairs.t1_us > 1000]
     assert np.abs(np.histogram(late, 10, (1000, 2000))[0] / len(late) - 0.1).max() < 0.02
     assert set(pairs.event_count.tolist()) == {0, 1, 2, 3}
@@ -91,7 +91,7 @@ def test_silent_pairs_end_at_any_time_and_at_every_pixel_whether_it_ever_fires_o
 
 def test_pairs_are_drawn_uniformly_and_all_of_them():
     events = recording(1, 60)
-    # Times that tell every event from every other.
+    # Unique times identify the events.
     events = Recording(events.x, events.y, np.arange(60, dtype=np.int64), events.polarity)
     index = index_of(events)
     for steps in (1, 3):
@@ -100,7 +100,7 @@ def test_pairs_are_drawn_uniformly_and_all_of_them():
         drawn = index.draw(np.full(200 * expected, steps), np.random.default_rng(0))
         counts = np.unique(drawn.t1_us, return_counts=True)[1]
         assert len(counts) == expected
-        # 200 draws a pair on average: five standard deviations.
+        # 200 draws per pair on average; the bound is five standard deviations.
         assert np.abs(counts - 200).max() < 5 * np.sqrt(200)
 
 
@@ -226,7 +226,7 @@ def test_a_hot_pixel_counts_for_nothing_unless_asked_for():
 
 
 def spaced(intervals_us: np.ndarray) -> PairIndex:
-    """Brighter events of one pixel with these times between them."""
+    """ON events of one pixel at these intervals."""
     t_us = np.r_[0, np.cumsum(intervals_us)].astype(np.int64)
     zeros = np.zeros(len(t_us), np.uint16)
     return index_of(Recording(zeros, zeros, t_us, np.ones(len(t_us), np.int8))).with_hot_pixels()
@@ -234,7 +234,7 @@ def spaced(intervals_us: np.ndarray) -> PairIndex:
 
 def test_blank_pixels_are_joined_with_blank_ones_at_one_time_and_with_no_others():
     random = np.random.default_rng(0)
-    # The left half of the sensor fires, and the right half but for one pixel never does.
+    # The left half of the sensor fires; in the right half, only one pixel does.
     pixel = random.integers(0, 40 * 20, 20_000)
     x, y = np.where(pixel % 40 < 20, pixel % 40, 35), np.where(pixel % 40 < 20, pixel // 40, 10)
     t_us = np.sort(random.integers(0, 10**6, len(pixel)))
@@ -252,7 +252,7 @@ def test_blank_pixels_are_joined_with_blank_ones_at_one_time_and_with_no_others(
 
 @pytest.mark.parametrize("steps", [1, 3, 12])
 def test_what_a_blind_pixel_missed_is_estimated(steps: int):
-    # Brightness rises by a threshold in 4 ms; after each event the pixel is blind for 1 ms.
+    # Brightness rises by a threshold in 4 ms; the refractory period is 1 ms.
     index = spaced(np.full(300, 5000))
     rate_per_us = 1 / 4000
     pairs = index.draw(np.full(50, steps), np.random.default_rng(0), 1000)
@@ -266,9 +266,9 @@ def test_what_a_blind_pixel_missed_is_estimated(steps: int):
 @pytest.mark.parametrize(
     ("polarity", "polarity_sum", "event_count"),
     [
-        # Blind half of the time: after each event as much is missed as that one says, up or down.
+        # Blind half of the time: one event of the same polarity is missed after each event.
         ([1, 1, -1, -1, 1, 1], 1, 9),
-        # Brightness that turns at every event says nothing of what comes after.
+        # Polarities that alternate give no rate to extrapolate.
         ([1, -1, 1, -1, 1, -1], -1, 5),
     ],
 )
@@ -283,20 +283,20 @@ def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
 
 
 def test_what_was_missed_goes_by_the_faster_neighbour():
-    # A threshold takes 4 ms but for the one in the middle, 1 ms, as long as the pixel is blind before and after it.
+    # A threshold takes 4 ms, except for the middle one, which takes 1 ms, the refractory period.
     pairs = spaced(np.array([5000, 2000, 5000])).draw(np.array([3]), np.random.default_rng(0), 1000)
     assert pairs.polarity_sum[0] == 3 + 2
 
 
 def test_what_was_missed_before_the_silence_counts_too():
-    # As above, with the time in which the pixel was blind after its last event but one, and after its last, in it.
+    # As above; the pairs span the refractory periods after the second to last and the last event.
     index = spaced(np.full(9, 5000))
     pairs = index.draw_silent(5000, 3, (20_000, 39_999), np.random.default_rng(0), 1000)
     pairs = pairs.select(pairs.pixel == 0)
     assert np.allclose(pairs.polarity_sum, pairs.event_count * 1.0)
     assert np.allclose(pairs.event_count, np.round(pairs.event_count / 1.25) * 1.25)
     assert np.allclose(pairs.variance, pairs.event_count / 1.25 * (1 + 8 * 0.25))
-    # What follows the very last one is not known.
+    # Nothing follows the very last event to estimate from.
     after = index.draw_silent(500, 1, (45_000, 50_000), np.random.default_rng(0), 1000)
     after = after.select(after.pixel == 0)
     assert set(after.event_count.tolist()) == {0.0, 1.0}

@@ -33,7 +33,7 @@ def test_edges_along_rows_columns_and_diagonals_are_not_hot():
 
 def test_dead_pixels_are_told_from_silent_ones_by_their_neighbours():
     counts = busy(30).reshape(HEIGHT, WIDTH)
-    # A blank wall: what is silent in it may well respond.
+    # A blank wall: its silent pixels may well work.
     counts[10:25, 15:35] = 0
     counts[3, 3] = 0
     dead = dead_pixels(counts.ravel(), WIDTH)

@@ -1,4 +1,4 @@
-"""What the recording tells of its sensor, on recordings of a sensor and textures that are the tests' own."""
+"""Sensor properties estimated from recordings of the test sensor."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def test_no_blind_time_is_made_of_the_fastest_edges_but_for_a_small_part_of_the_
 
 def test_pixels_that_fire_at_once_are_not_blind():
     made = record(photograph, to_and_fro)
-    # Edges that are crossed within a microsecond, as sharp ones of a simulator are.
+    # Edges that are crossed within a microsecond, as in simulations.
     again = Recording(*(np.repeat(column, 2) for column in (made.x, made.y, made.t_us, made.polarity)))
     assert estimated_refractory_us(index_of(again)).value == 0
 

@@ -20,7 +20,7 @@ Light = Callable[[float], np.ndarray]
 
 
 def indexed(events: Events) -> tuple[np.ndarray, np.ndarray]:
-    """Events and beginnings of pixels, as the functions take them."""
+    """Sorted events and the start index of each pixel."""
     pixel, t_us, polarity = (column[np.argsort(events[1], kind="stable")] for column in events)
     x, y = (pixel % WIDTH).astype(np.uint16), (pixel // WIDTH).astype(np.uint16)
     recording = Recording(x, y, t_us.astype(np.int64), polarity.astype(np.int8))
@@ -29,7 +29,7 @@ def indexed(events: Events) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fired(light: Light, seconds: float, step_us: int = 200, blind_us: int = 0) -> Events:
-    """What pixels with thresholds of 0.25 (3 % of mismatch) report of a log brightness over time in seconds."""
+    """Events of pixels with thresholds of 0.25 (3 % mismatch) for a log brightness over time in seconds."""
     random = np.random.default_rng(0)
     thresholds = {sign: 0.25 * (1 + 0.03 * random.standard_normal(SHAPE)) for sign in (1, -1)}
     before = light(0.0)
@@ -72,7 +72,7 @@ def bars(period: int) -> np.ndarray:
 
 
 def moving(picture: np.ndarray, vx: float, vy: float = 0, shaken_hz: float = 0) -> Light:
-    """A picture that passes at so many pixels a second, or is shaken."""
+    """A picture that moves at a velocity in pixels per second, or is shaken."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
 
     def light(t: float) -> np.ndarray:
@@ -83,7 +83,7 @@ def moving(picture: np.ndarray, vx: float, vy: float = 0, shaken_hz: float = 0) 
 
 
 def lit(light: Light, hz: float, amplitude: float, where: np.ndarray = EVERYWHERE, drift_hz: float = 0) -> Light:
-    """The same under a lamp, whose rate changes by ``drift_hz`` a second."""
+    """The same scene under a flickering lamp whose frequency drifts by ``drift_hz`` per second."""
 
     def under_lamp(t: float) -> np.ndarray:
         return light(t) + where * np.log1p(amplitude * np.cos(2 * np.pi * (hz + drift_hz * t / 2) * t))
@@ -119,13 +119,13 @@ def test_ordinary_clocks_have_no_step(ordinary: Events):
     assert clock_step_us(noise(1.0, 1000, 1)[1]) == 1
     for few in ([], [5], [5, 10], [7] * 1000, [7, 1007] * 500):
         assert clock_step_us(np.array(few, np.int64)) == 1
-    # Of two clocks, only one has steps.
+    # Two mixed clocks, only one of which has steps.
     mixed = np.where(np.arange(len(ordinary[1])) % 20 == 0, ordinary[1], ordinary[1] // 100 * 100)
     assert clock_step_us(mixed) == 1
 
 
 def doubled(events: Events, share: float, within_us: int) -> Events:
-    """Some events come again, at most so much later."""
+    """Repeat a share of the events up to ``within_us`` later."""
     random = np.random.default_rng(3)
     pixel, t_us, polarity = events
     again = random.choice(len(pixel), int(share * len(pixel)), replace=False)
@@ -205,14 +205,14 @@ def test_a_recording_too_short_to_tell_has_no_flicker():
         moving(TEXTURE, 60, 13),
         moving(TEXTURE, 100),
         moving(TEXTURE, 500),
-        # Edges that cross all pixels of a column at once, and one column after another at a constant rate.
+        # Edges that cross all pixels of a column at once, column by column at a constant rate.
         moving(bars(8), 100),
         moving(bars(8), 500),
-        # A grating under which each pixel turns at 100 Hz, one after another.
+        # A grating under which pixels oscillate at 100 Hz with different phases.
         moving(bars(4), 400),
         moving(bars(12), 1200),
         moving(TEXTURE, 20, 5, shaken_hz=80),
-        # Frames of 25 Hz that disturb all pixels.
+        # 25 Hz frames that disturb all pixels.
         lambda t: moving(TEXTURE, 60, 13)(t) + 0.4 * (25 * t % 1 < 0.05),
         # A lamp too faint for pixels to follow.
         lit(moving(TEXTURE, 60, 13), 100, 0.05),
@@ -253,7 +253,7 @@ def test_recordings_from_elsewhere(name: str, width: int, height: int):
     recording = read_recording(path, width, height)
     index = index_pairs(lambda: [recording], width, height)
     assert clock_step_us(recording.t_us) == 1
-    # Frames at 19.6 Hz disturb the office's pixels: lines at 98 and 118 Hz, which are no lamps.
+    # Frames at 19.6 Hz disturb the pixels of the office recording: lines at 98 and 118 Hz that are not lamps.
     assert flicker_hz(index.events, index.first).hz is None
     share, within_us = doubles(index.events, index.first)
     if name == "office_pan_tilt":
