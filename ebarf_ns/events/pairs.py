@@ -151,7 +151,7 @@ class PairIndex:
     def draw_silent(
         self, count: int, longest: int, span_us: tuple[int, int], random: np.random.Generator, refractory_us: int = 0
     ) -> EventPairs:
-        """Draw pairs that end at a random time in the span and begin at an event, 0 to ``longest`` events earlier.
+        """Draw pairs that begin at an event and end at a random time in the span, with 0 to ``longest`` events between.
 
         Uniform over time and the ``responsive`` pixels. For a pixel that has not fired by then, the pair begins at a
         random earlier time.

@@ -43,7 +43,7 @@ def dead_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndar
 
 
 def _dead_lines(active_share: np.ndarray) -> np.ndarray:
-    """Lines of silent pixels between a border and a line at least half as active as usual."""
+    """Lines of silent pixels between a border and a line more than half as active as usual."""
     found = np.zeros(len(active_share), bool)
     somewhere = np.nonzero(active_share)[0]
     if not len(somewhere):

@@ -32,7 +32,7 @@ def orbit(ahead_us: int = 0, count: int = 60) -> Trajectory:
 
 
 def corrected(path: Trajectory, offset_us: int, error_rad: float, seed: int, width: float = 5.0) -> Trajectory:
-    """Where keyframes of a clock that is off belong, but for smooth errors of a correction."""
+    """Corrected keyframes for a clock offset, with smooth errors of the correction."""
     inside = interpolate(path.t_us, path.poses, path.t_us - offset_us, "cubic")
     random = np.random.default_rng(seed)
     turn = quat_wxyz_exp(smooth_noise(random, len(path.t_us), error_rad, width))
@@ -50,7 +50,7 @@ def test_an_offset_is_found_to_a_millisecond(offset_us: int):
 
 @pytest.mark.parametrize("error_rad, width", [(1e-9, 2.0), (1e-3, 0.1), (0.05, 2.0), (0.05, 10.0)])
 def test_errors_that_are_no_offset_are_taken_for_none(error_rad: float, width: float):
-    """Of 4 hand-held trajectories that drift, none is given another clock."""
+    """None of 4 drifting handheld trajectories gets a clock offset."""
     wrong = []
     for seed in range(4):
         path = hand_held(seed)

@@ -50,7 +50,7 @@ def test_among_few_keyframes_noise_is_seldom_followed():
         noise = 0.01 * torch.from_numpy(np.random.default_rng(seed).standard_normal((17, 3)))
         noisy = Trajectory(t_us, Poses(line.poses.position + noise, still))
         left.append(errors(smoothed(noisy), line)[0] / errors(noisy, line)[0])
-    # A straight line fitted would leave the root of 2 / 17: 0.34.
+    # A fitted straight line would leave sqrt(2 / 17) = 0.34.
     assert np.median(left) < 0.4 and np.quantile(left, 0.9) < 0.55
 
 

@@ -28,7 +28,7 @@ def keyframes(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> 
 def parabolic_at_the_ends(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """A cubic spline whose second derivative is constant in the first and the last interval."""
     if len(knots) < 4:
-        # Two points have a line, three a parabola.
+        # Two points define a line, three a parabola.
         return BarycentricInterpolator(knots, values)(at)
     flat = [(3, np.zeros(values.shape[1]))]
     return make_interp_spline(knots, values, k=3, bc_type=(flat, flat))(at)
@@ -51,7 +51,7 @@ def test_agrees_with_scipy(seed: int, count: int, kind: str):
 
 
 def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, float]:
-    """Largest error [m, rad] of a motion that turns and goes to and fro, under way when it begins and when it ends."""
+    """Largest error [m, rad] for a rotating, oscillating motion that is under way at both ends."""
 
     def motion(t_us: np.ndarray) -> tuple[np.ndarray, Rotation]:
         t = t_us[:, None] * 1e-6
@@ -74,7 +74,7 @@ def test_a_spline_follows_a_smooth_motion_that_lines_cut_short():
         np.array(errors_between_keyframes(*what)) for what in (("linear", 20), ("cubic", 20), ("cubic", 40))
     )
     assert (splines < 0.1 * lines).all()
-    # At the ends, and for rotations, whose frames turn, the error goes with the third power of the spacing.
+    # At the ends, and for rotations, whose frames rotate, the error is cubic in the spacing.
     assert (splines / finer > 6).all()
 
 

@@ -1,4 +1,4 @@
-"""Torn trajectories are named, and those that go on are not, however they move."""
+"""Discontinuous trajectories are reported; continuous ones are not, however they move."""
 
 import numpy as np
 import pytest

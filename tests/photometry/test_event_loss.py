@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
+from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, target_change, threshold_loss
 
 
 def batch(count: int, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -35,11 +35,11 @@ def test_threshold_loss_is_equation_five_in_thresholds():
 def test_while_a_pixel_is_silent_half_of_a_change_within_the_thresholds_is_allowed_and_no_more_beyond():
     change = torch.tensor([0.1, 0.5, -0.25, -0.35, 0.1], requires_grad=True)
     silent = torch.tensor([True, True, True, True, False])
-    allowed = nearest_allowed(change, torch.zeros(5), silent, torch.tensor(0.2), torch.tensor(0.3))
+    allowed = target_change(change, torch.zeros(5), silent, torch.tensor(0.2), torch.tensor(0.3))
     assert torch.allclose(allowed, torch.tensor([0.05, 0.1, -0.125, -0.15, 0.0]))
     assert not allowed.requires_grad
     reported = torch.tensor([1.0, 1.0], requires_grad=True)
-    allowed = nearest_allowed(torch.tensor([1.1, 3.0]), reported, torch.tensor([True, False]), 0.2, 0.3)
+    allowed = target_change(torch.tensor([1.1, 3.0]), reported, torch.tensor([True, False]), 0.2, 0.3)
     assert torch.autograd.grad(allowed.sum(), reported)[0].tolist() == [1.0, 1.0]
 
 
@@ -73,5 +73,5 @@ def test_outliers_count_by_their_size_and_small_errors_by_their_square():
 
     plain, robust = gradient(None), gradient(0.3)
     assert robust[0] == pytest.approx(float(plain[0]))
-    # Both are 20 standard deviations off, or 0.3 as far as the gradient goes.
+    # Both errors are 20 standard deviations, and act on the gradient like 0.3.
     assert torch.allclose(robust[1:], plain[1:] * 0.3 / 20)

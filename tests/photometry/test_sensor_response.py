@@ -68,7 +68,7 @@ def test_dark_pixels_lag_behind_longer_in_inverse_proportion_to_their_intensity(
     assert not list(sensor.parameters()) and sensor.delays
     intensity = torch.tensor([0.01, 0.5, 1.0, 2.0])
     mean = float(intensity.log().mean().exp())
-    # The darkest would be late by 32 times the time constant.
+    # Without the bound, the darkest pixel would be delayed by 32 time constants.
     expected_us = [16_000, *(2000 * mean / intensity[1:]).tolist()]
     assert sensor.delay_us(intensity.log()).tolist() == pytest.approx(expected_us)
 
