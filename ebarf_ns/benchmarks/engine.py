@@ -40,7 +40,7 @@ from ebarf_ns.benchmarks.settings import PARTS, EngineBenchmark, Part
 from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
 from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.radiance.field import fastest_precision
-from ebarf_ns.radiance.hash_grid import HashGrid, encode_reference, fastest_carrier
+from ebarf_ns.radiance.hash_grid import HashGrid, encode_reference, fastest_backend
 from ebarf_ns.radiance.lattice import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
 
@@ -58,7 +58,7 @@ def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] =
     return {
         "date": date.today().isoformat(),
         "machine": machine(),
-        "carrier": fastest_carrier(torch.zeros(0, 3, device=device())),
+        "backend": fastest_backend(torch.zeros(0, 3, device=device())),
         "precision": fastest_precision(device()),
         "versions": {"torch": torch.__version__, "numpy": np.__version__},
         "quick": settings.quick,
@@ -74,7 +74,7 @@ class _Engine:
         self._repetitions = 2 if settings.quick else 9
 
     def hash_grid(self) -> Iterator[Figure]:
-        """Forward and backward with position gradients: the fastest carrier, the torch reference, nerfstudio's."""
+        """Forward and backward with position gradients: the fastest backend, the torch reference, nerfstudio's."""
         count = 1_000 if self.quick else 100_000
         shape = HashGridShape(levels=16, features=2, coarsest=16, finest=1024, table_size_log2=19)
         grid = HashGrid(shape).to(device())
@@ -96,7 +96,7 @@ class _Engine:
             theirs = self._both_ways(theirs_encode, point, theirs_parameters, few=True) if theirs_encode else math.nan
             rounds.append((ours, theirs, theirs / ours))
         ours, theirs, ratio = (median(column) for column in zip(*rounds, strict=True))
-        yield Figure(f"{name}, {fastest_carrier(point)}", 1e3 * ours, "ms")
+        yield Figure(f"{name}, {fastest_backend(point)}", 1e3 * ours, "ms")
         if device() == "cuda":
             # Each corner is read, read again and added to; points and features come and go once.
             moved = count * 16 * (8 * 2 * 4 * 4 + 2 * 2 * 4) + count * 3 * 4 * 3

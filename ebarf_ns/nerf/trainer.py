@@ -38,7 +38,7 @@ from ebarf_ns.nerf.run_folder import take_folder
 from ebarf_ns.nerf.settings_check import check_machine, check_settings
 from ebarf_ns.nerf.support import Support, support
 from ebarf_ns.plan import Line, apply_plan, plan_for
-from ebarf_ns.radiance.hash_grid import fastest_carrier
+from ebarf_ns.radiance.hash_grid import fastest_backend
 from ebarf_ns.scene import Scene, check_bounds, read_scene, write_camera
 
 _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
@@ -386,7 +386,7 @@ class EbarfTrainer(Trainer):
             "scene": str(scene.folder.resolve()),
             "scene_digest": scene_digest(scene),
             "config_digest": config_digest(configuration),
-            "hash_grid": fastest_carrier(torch.zeros(0, 3, device=self.device)),
+            "hash_grid": fastest_backend(torch.zeros(0, 3, device=self.device)),
             "blind_us": self.pipeline.datamanager.refractory_us,
             "hot_pixels_left_out": self.pipeline.datamanager.hot_pixels_left_out,
             "alignment": asdict(self.alignment) if self.alignment else None,

@@ -34,7 +34,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 def test_every_part_yields_finite_figures(result: dict):
-    assert result["quick"] and result["machine"] and result["carrier"] == "numba"
+    assert result["quick"] and result["machine"] and result["backend"] == "numba"
     assert all(math.isfinite(figure["value"]) for figure in result["figures"])
     names = " ".join(figure["what"] for figure in result["figures"])
     for words in ("hash grid against", "pairs per second", "sampler's speed", "growth with keyframes", "frame",

@@ -64,7 +64,7 @@ def test_half_precision_products_change_answers_and_gradients_by_little():
         assert density.dtype == intensity.dtype == torch.float32
         (gradient,) = torch.autograd.grad((density + intensity).sum(), point)
         found[precision] = density.log(), intensity.log(), gradient
-    # Eight bits of mantissa, through four products and for gradients back through four more.
+    # Eight bits of mantissa, through four products and, for gradients, four more.
     for exact, rounded, tolerance in zip(*found.values(), (0.02, 0.02, 0.05), strict=True):
         assert not torch.equal(exact, rounded)
         assert (exact - rounded).norm() < tolerance * exact.norm()

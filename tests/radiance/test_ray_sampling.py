@@ -164,7 +164,7 @@ def test_samples_placed_in_one_pass_are_those_of_the_reference(bounded: bool, pa
         far, jitter = far.view(2, -1).amax(0).repeat(2), jitter[:20].repeat(2, 1)
     ours = ray_sampling_numba.importance_edges(grid, rays, 0.05, far, 64, 0.1, 0.3, 24, jitter, pairs)
     theirs = importance_edges(grid, rays, 0.05, far, 64, 0.1, 0.3, 24, jitter, pairs)
-    # A point on a cell's border may fall to either side.
+    # A point on a cell border may fall on either side.
     assert ((ours - theirs).abs() < 2e-3 * far[:, None].clamp_min(0.1)).float().mean() > 0.98
     assert (ours.diff(dim=-1) >= 0).all() and (not pairs or torch.equal(ours[:20], ours[20:]))
 
