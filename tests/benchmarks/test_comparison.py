@@ -1,4 +1,4 @@
-"""A whole comparison in miniature, by the command that users type."""
+"""A whole comparison in miniature, through the user's command."""
 
 import json
 import shutil
@@ -62,7 +62,7 @@ def test_scenes_of_one_seed_share_their_events(comparison: Path):
     true, drift = made(comparison, "true"), made(comparison, "drift")
     assert true.events == drift.events and true.events.is_file()
     assert true.trajectory.read_text() != drift.trajectory.read_text()
-    # A trajectory in another unit is that of a scene in another unit.
+    # A trajectory in another unit comes with bounds in that unit.
     assert np.allclose(np.array(drift.bounds), 2 * np.array(true.bounds))
 
 
@@ -70,7 +70,7 @@ def test_diagrams_and_tables_show_every_method(comparison: Path):
     out = comparison / "out"
     curves, profile = ((out / name).read_text() for name in ("work_precision.svg", "profile.svg"))
     assert all(f"<!-- {name} -->" in curves for name in ("ebarf", "floor", "as given"))
-    # Floors have no problem of their own to solve.
+    # Floors are not part of the performance profile.
     assert "<!-- ebarf -->" in profile and "<!-- floor -->" not in profile
     tables = (out / "tables.md").read_text()
     assert "| tiny | drift | ebarf |" in tables and "not reached" in tables and "1 training failed" in tables

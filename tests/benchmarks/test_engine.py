@@ -1,4 +1,4 @@
-"""The engine benchmark runs; how fast things are is its business, not that of these tests."""
+"""The engine benchmark runs; speed is not tested here."""
 
 import json
 import math

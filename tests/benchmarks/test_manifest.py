@@ -59,7 +59,7 @@ def test_floors_are_trained_once_whatever_the_trajectory(tmp_path: Path):
     assert {job.trajectory for job in found if job.method == "floor"} == {TRUE}
     names = {job.name("this") for job in found}
     assert len(names) == len(found) and all("/" not in name for name in names)
-    # What is made of something else has another name: its result is not taken for this one's.
+    # A different definition has a different name, so that results are not confused.
     assert found[0].name("this") != found[0].name("that")
 
 

@@ -34,7 +34,7 @@ def test_white_noise_has_the_size_that_was_asked_for():
 def test_drift_starts_at_nothing_grows_and_reaches_its_size():
     shift, turn = deviations(perturb(TRUE, TrajectoryErrors(**NONE, position_drift=0.05, rotation_drift_rad=0.04), 0))
     assert shift[0] < 1e-12 and shift.max() == pytest.approx(0.05) and turn.max() == pytest.approx(0.04)
-    # From keyframe to keyframe it hardly changes.
+    # It hardly changes between neighbouring keyframes.
     assert np.abs(np.diff(shift)).max() < 0.01
 
 
