@@ -1,4 +1,4 @@
-"""What is decided for a scene, why, and who may overrule it."""
+"""Planned configuration values, their reasons, and overrides."""
 
 import dataclasses
 import json
@@ -170,7 +170,7 @@ def test_inspect_prints_the_plan_a_run_keeps_and_flags_overrule(trained_run: Pat
 
 
 def swinging(keyframes: int, uneven: bool = False) -> Trajectory:
-    """Two seconds of turning to and fro, a radian a second at most."""
+    """Two seconds of oscillating rotation, at most one radian per second."""
     t_us = torch.linspace(0, 2e6, keyframes).round().long()
     if uneven:
         t_us[1] = t_us[0] + 1000
@@ -196,7 +196,7 @@ def test_a_spline_only_where_the_motion_between_keyframes_needs_and_carries_it(
 
 
 def shaken(hertz: float, every_us: int, count: int) -> Trajectory:
-    """A camera that turns to and fro by a tenth of a radian, so many times a second."""
+    """A camera that oscillates by a tenth of a radian at the given frequency."""
     t_us = torch.arange(count) * every_us
     angle = 0.1 * torch.sin(2 * torch.pi * hertz * t_us.double() * 1e-6)
     zero = torch.zeros_like(angle)

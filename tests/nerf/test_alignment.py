@@ -34,7 +34,7 @@ def test_without_the_time_for_it_nothing_moves(tiny_scene: Path, tmp_path: Path)
 
 
 def ready_trainer(folder: Path, errors: TrajectoryErrors, duration_s: float = 1.5) -> tuple[EbarfTrainer, Path]:
-    """A trainer of a small room that has not aligned anything yet."""
+    """A trainer for a small room, before alignment."""
     made = Simulation(
         width=80, height=60, focal_px=70.0, duration_s=duration_s, frames=1, rays_per_pixel=4, errors=errors
     )

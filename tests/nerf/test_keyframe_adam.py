@@ -7,7 +7,7 @@ from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 
 
 def descend(optimizer: torch.optim.Optimizer, rows: torch.Tensor, stiffness: torch.Tensor, steps: int) -> float:
-    """Noisy gradients of a quadratic bowl that is steep along some directions and flat along others."""
+    """Noisy gradients of an ill-conditioned quadratic bowl."""
     generator = torch.Generator().manual_seed(0)
     root = torch.linalg.cholesky(stiffness)
     for _ in range(steps):
@@ -34,7 +34,7 @@ def test_without_stretches_for_rows_of_one_number_it_is_adam():
 def test_not_coupled_no_number_knows_of_the_others():
     gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
     rows, alone = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(18, 1))
-    # Without eps, which is a share of the mean over all six.
+    # With eps = 0, since it is a share of the mean over all six.
     one = KeyframeAdam([rows], eps=0.0, coupled=False, stretches=False)
     other = KeyframeAdam([alone], eps=0.0, stretches=False)
     for gradient in gradients:
@@ -45,7 +45,7 @@ def test_not_coupled_no_number_knows_of_the_others():
 
 
 def test_a_soft_direction_among_stiff_ones_is_followed_sooner_than_by_adam():
-    # The sum of the two is told a thousand times better than their difference.
+    # The sum of the two is constrained a thousand times better than their difference.
     stiffness = torch.tensor([[1.0, 0.999], [0.999, 1.0]])
     start = torch.tensor([[1.0, -1.0]])
     way = {}
@@ -57,7 +57,7 @@ def test_a_soft_direction_among_stiff_ones_is_followed_sooner_than_by_adam():
 
 @pytest.mark.parametrize("count", [40, 41])
 def test_a_bend_of_the_whole_is_followed_beneath_the_noise_of_each_row(count: int):
-    # Each row's gradient is ten times noisier than the bend is strong.
+    # The noise of each row's gradient is ten times the bend.
     bend = 0.1 * torch.linspace(-1, 1, count)[:, None].expand(-1, 6)
     gained = {}
     for stretches in (True, False):
