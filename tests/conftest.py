@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from ebarf_ns.cli.main import entrypoint
+from ebarf_ns.cli.entry import entrypoint
 
 # How long an example takes says more of what else the machine does than of the code.
 settings.register_profile("ebarf", deadline=None)

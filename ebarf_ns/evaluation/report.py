@@ -13,7 +13,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from ebarf_ns.errors import EvaluationError
+from ebarf_ns.errors import EvaluationError, did_you_mean
 from ebarf_ns.evaluation.frames import lpips_note
 from ebarf_ns.evaluation.report_figures import (
     axes_figure,
@@ -69,13 +69,19 @@ def read_metrics(run: Path) -> tuple[Record, list[Record]]:
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     except OSError as error:
-        raise EvaluationError(f"{path}: {error.strerror or error}; expected the folder of a training run") from None
+        expected = f"expected the folder of a training run{_runs_below(run)}"
+        raise EvaluationError(f"{path}: {error.strerror or error}; {expected}") from None
     except json.JSONDecodeError as error:
         raise EvaluationError(f"{path}: not one JSON object a line ({error})") from None
     evaluations = [line for line in lines if "train_seconds" in line]
     if not evaluations:
         raise EvaluationError(f"{path}: holds no evaluation yet, expected at least one")
     return lines[0], evaluations
+
+
+def _runs_below(folder: Path) -> str:
+    found = sorted(path.parent for path in folder.rglob("metrics.jsonl")) if folder.is_dir() else []
+    return f", such as {', '.join(map(str, found[-3:]))}" if found else did_you_mean(folder)
 
 
 def write_report(run: Path, groundtruth: Path | None) -> Path:

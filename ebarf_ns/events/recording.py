@@ -152,9 +152,10 @@ class RecordingFile:
         ):
             if wrong.any():
                 row = int(wrong.argmax())
+                others = f" ({np.count_nonzero(wrong):,} such rows of the {len(t):,} from row {begin} on)"
                 raise RecordingError(
-                    f"{self.path}: /events/{name} row {begin + row} is {piece[name][row]}, expected {expected} "
-                    f"({np.count_nonzero(wrong):,} such rows of the {len(t):,} from row {begin} on)"
+                    f"{self.path}: /events/{name} row {begin + row} is {piece[name][row]}, expected {expected}"
+                    f"{others if len(t) > 1 else ''}"
                 )
 
 

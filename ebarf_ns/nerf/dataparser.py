@@ -76,6 +76,7 @@ class EbarfDataParser(DataParser):
         super().__init__(config)
         with one_line_errors():
             self.scene = read_scene(_scene_folder(config))
+            _say_what_is_missing(self.scene)
             self.trajectory = read_tum(self.scene.trajectory)
             _check_scene_is_the_runs(self.scene, self.trajectory, config.kept)
             self.normalization = _normalization(self.scene, self.trajectory)
@@ -148,6 +149,15 @@ def _scene_folder(config: EbarfDataParserConfig) -> Path:
         raise SceneError(moved(config))
     sys.stderr.write(f"opened by the run's own {config.kept}, without frames and recording ({moved(config)})\n")
     return config.kept
+
+
+def _say_what_is_missing(scene: Scene) -> None:
+    """Frames show how good a training is, and it goes on without them."""
+    if scene.missing:
+        sys.stderr.write(
+            f"warning: {scene.missing[0]}: no such file; {len(scene.missing)} of the validation frames' files are "
+            f"missing, and {len(scene.frames)} frames are left to compare renders with\n"
+        )
 
 
 def _check_scene_is_the_runs(scene: Scene, trajectory: Trajectory, kept: Path | None) -> None:

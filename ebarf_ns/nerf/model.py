@@ -16,6 +16,7 @@ from torch import Tensor
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.nerf.intrinsics import Intrinsics
+from ebarf_ns.nerf.old_flags import old_names
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, target_change, threshold_loss
@@ -52,7 +53,7 @@ class EbarfModelConfig(ModelConfig):
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
     loss: Literal["threshold", "normalized"] = "threshold"
     """Eq. 5, with thresholds taken as equal where the scene does not give them; or the paper's Eq. 6."""
-    huber_delta: Annotated[float | None, tyro.conf.arg(aliases=["--pipeline.model.outliers-from"])] = 0.3
+    huber_delta: Annotated[float | None, tyro.conf.arg(aliases=old_names("--pipeline.model.huber-delta"))] = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     render_variance: float = 5.0
     """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -16,7 +15,7 @@ from ebarf_ns.errors import EvaluationError, one_line_errors
 from ebarf_ns.evaluation.frames import depth_error, fit_brightness, image_errors, read_depth, read_frame
 from ebarf_ns.evaluation.heldout import prediction
 from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world, trajectory_results
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import whole_file, write_picture
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.checkpoints import unsealed
@@ -203,7 +202,7 @@ class EbarfPipeline(VanillaPipeline):
             for k, (fitted, reference) in enumerate(pairs):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
                 with whole_file(renders / f"{k:04d}.png") as temporary:
-                    cv2.imwrite(str(temporary), (beside * 255).round().astype(np.uint8))
+                    write_picture(temporary, (beside * 255).round().astype(np.uint8))
         depths = []
         unit = (scale_to_reference or 1.0) / self._normalization.scale
         for frame, output in zip(frames, outputs, strict=True):

@@ -27,8 +27,10 @@ _MAX_LOG_DENSITY = 12.0
 def fastest_precision(device: torch.device | str) -> Precision:
     """bfloat16 if the processor supports it natively, else float32."""
     if torch.device(device).type == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported() else "float32"
-    able = torch.cpu.get_capabilities()
+        # Before torch 2.5, is_bf16_supported raises without a GPU.
+        return "bfloat16" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "float32"
+    # Before torch 2.11, get_capabilities does not exist.
+    able = getattr(torch.cpu, "get_capabilities", dict)()
     return "bfloat16" if able.get("avx512_bf16") or able.get("amx_bf16") else "float32"
 
 

@@ -7,6 +7,7 @@ those of tiny-cuda-nn, so that a trained table works with every backend.
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Literal
@@ -68,21 +69,34 @@ def fastest_backend(point: Float[Tensor, "points 3"]) -> Backend:
     if point.dtype == torch.float32 and point.device.type == "cpu":
         return "numba"
     if point.dtype == torch.float32 and point.is_cuda:
-        return "tcnn" if _importable("tinycudann") else "triton" if _importable("triton") else "torch"
+        if not why_not("tinycudann"):
+            return "tcnn"
+        if not why_not("triton"):
+            return "triton"
+        _warn_slow()
     return "torch"
 
 
 @lru_cache
-def _importable(name: str) -> bool:
-    """Whether a module is installed and works here: tiny-cuda-nn raises its own errors on GPUs it was not built for,
-    and Triton compiles its driver at first use."""
+def why_not(name: str) -> str:
+    """Why a library is not used, empty if it is: tiny-cuda-nn raises its own errors on GPUs it was not built for, and
+    Triton compiles its driver at first use."""
     try:
         module = import_module(name)
         if name == "triton":
             module.runtime.driver.active.get_current_device()
-    except Exception:
-        return False
-    return True
+    except Exception as error:
+        return " ".join(str(error).split()) or type(error).__name__
+    return ""
+
+
+@lru_cache
+def _warn_slow() -> None:
+    """Warn once about the slow backend."""
+    sys.stderr.write(
+        "the hash grid runs in plain torch on this GPU, about 200 times slower, without Triton "
+        f"({why_not('triton'):.120}) and tiny-cuda-nn ({why_not('tinycudann'):.120})\n"
+    )
 
 
 _encodings: dict[HashGridShape, nn.Module] = {}

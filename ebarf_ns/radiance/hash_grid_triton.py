@@ -8,8 +8,7 @@ GPU.
 # Triton's language is not Python to a type checker.
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 
-from __future__ import annotations
-
+# No postponed annotations: Triton 3.0's interpreter needs tl.constexpr itself, not a string.
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,8 +25,8 @@ _BLOCK = 128  # points per program
 
 
 def encode(
-    point: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], lattice: Lattice
-) -> Float[Tensor, "points width"]:
+    point: "Float[Tensor, 'points 3']", table: "Float[Tensor, 'rows features']", lattice: "Lattice"
+) -> "Float[Tensor, 'points width']":
     """Features of float32 points on a GPU, differentiable in points and table."""
     levels = (lattice.stretch, lattice.resolution, lattice.first_row)
     encoded: Tensor = _Encoding.apply(point, table, *levels)  # pyright: ignore[reportAssignmentType]

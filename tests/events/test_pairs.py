@@ -202,6 +202,14 @@ def test_no_room_for_the_file_of_an_index_is_said(monkeypatch: pytest.MonkeyPatc
         index_of(recording(0, 300), memory_bytes=16)
 
 
+def test_a_system_that_cannot_reserve_room_has_an_index_on_disk_too(monkeypatch: pytest.MonkeyPatch):
+    events = recording(3, 300)
+    whole = index_of(events)
+    monkeypatch.delattr("os.posix_fallocate", raising=False)
+    on_disk = index_of(events, memory_bytes=16)
+    assert isinstance(on_disk.events, np.memmap) and np.array_equal(whole.events, on_disk.events)
+
+
 def test_edges_that_have_nearly_all_events_count_in_full():
     random = np.random.default_rng(0)
     pixel = np.r_[np.repeat(np.arange(180), 1000), np.arange(180, 20_000)]

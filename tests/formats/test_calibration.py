@@ -1,4 +1,4 @@
-"""Calibrations as others write them are read, and what is wrong with one is said in a line that names file and key."""
+"""Foreign calibration files are read, and errors are one line that names file and key."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Files whose columns or times do not say what they are: values tell, or a flag is asked for."""
+"""Files with unnamed columns or time units: inferred from the values, or asked for by a flag."""
 
 from itertools import permutations
 from pathlib import Path
@@ -107,7 +107,7 @@ def test_where_two_orders_fit_a_flag_is_asked_for(tmp_path: Path, suffix: str):
 
 def test_a_stated_order_is_taken_and_checked(tmp_path: Path):
     path = save(tmp_path / "a.txt", table("tyxp"))
-    with pytest.raises(RecordingError, match="are they swapped. --event-columns 't y x p' says so"):
+    with pytest.raises(RecordingError, match="are they swapped. Then use --event-columns 't y x p'"):
         checked(open_recording(path), SIZE)
     same(open_recording(path, columns="t, y, x, p"))
     with pytest.raises(RecordingError, match="--event-columns is 'xy', expected t, x, y and p once each"):

@@ -1,4 +1,4 @@
-"""Nothing is lost in silence on the way into a scene."""
+"""No event is lost silently on import."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -109,8 +109,8 @@ def test_each_thing_left_out_is_counted(tmp_path: Path):
     intake = Intake(duplicates="drop", refractory_us=8, end_us=8000, time_offset_us=0)
     report = take_in(source(events), SIZE, intake, tmp_path / "events.h5", hot)
     assert report.left_out == {
-        "events outside the time window": 1, "events of 1 hot pixels": 403, "events twice over": 1,
-        "events within the refractory time": 1,
+        "events outside the time window": 1, "events of 1 hot pixels": 403, "duplicate events": 1,
+        "events in the refractory period": 1,
     }  # fmt: skip
     assert report.kept == len(events) - 406 and report.read == len(events)
     assert any("left out: 403" in sentence for sentence in report.sentences())

@@ -1,4 +1,4 @@
-"""Datasets' folders, made here with the keys, types and clocks that their authors use, become scenes."""
+"""Synthetic dataset folders with the keys, types and clocks of their authors become scenes."""
 
 import json
 import shutil
@@ -63,7 +63,7 @@ def picture(path: Path, side: int = 16) -> None:
 
 
 def basalt(turn: Rotation) -> dict:
-    """TUM-VIE's own layout, with its event cameras as small as the events here."""
+    """TUM-VIE's layout, with event cameras as small as the test recording."""
     qx, qy, qz, qw = turn.as_quat().tolist()
     pose = {"px": 0.1, "py": 0.0, "pz": -0.05, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
     still = {"px": 0.0, "py": 0.0, "pz": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
@@ -193,7 +193,7 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
         (tmp_path / "odometry.txt").write_text(poses("s"))
         words += ["--trajectory", tmp_path / "odometry.txt"]
     if name == "eds":
-        # The real camera is larger than the events here need.
+        # The real camera is larger than the test recording.
         words += ["--start-us", 1_600_000_000_000_000]
     else:
         words += ["--start-us", 0]
@@ -203,7 +203,7 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
     assert (scene.contrast_threshold is None) == (path.stem in ("eds_00", "evo_flyingroom"))
     if name == "eds":
         assert [frame.camera.fx for frame in scene.frames] == pytest.approx([766.536] * 3, abs=1e-3)
-        # The frames' camera is 4.4 mm behind that of the events.
+        # The frame camera is 4.4 mm behind the event camera.
         assert scene.frames[0].event_camera_from_frame_camera[2][3] == pytest.approx(-0.0044167, abs=1e-6)
 
 
@@ -290,7 +290,7 @@ def test_a_trajectory_on_another_clock_is_an_error(tmp_path: Path):
 
 
 def odometry(tmp_path: Path, text: str, **settings: Any) -> tuple[list[str], list[str]]:
-    """What is said of the trajectory, and what is suspected of its scene."""
+    """Notes on the trajectory, and suspicions about its scene."""
     (tmp_path / "odometry.txt").write_text(text)
     known = ProcessSettings(camera=calibration(tmp_path), trajectory=tmp_path / "odometry.txt", **settings)
     source = tmp_path / "source"
@@ -373,13 +373,13 @@ def test_frames_of_a_bag_are_those_beside_its_events(tmp_path: Path):
 
 GREY = np.arange(48 * 64).reshape(48, 64) % 180 + 20
 BAYER_ON = {"bayer_rggb8": (0, 0), "bayer_bggr8": (1, 1), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0)}
-"""Where the red pixels begin."""
+"""Position of the first red pixel."""
 
 
 def image_bag(
     path: Path, encoding: str, pixels: np.ndarray, size: tuple[int, int] = (64, 48), big: bool = False
 ) -> Path:
-    """Events and two images that say of themselves what is given."""
+    """Events and two images with the given fields."""
     store = types(1)
     image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in STEREO)
     with Writer1(path) as bag:
@@ -406,7 +406,7 @@ def frames_and_sentences(tmp_path: Path, bag: Path) -> tuple[list[np.ndarray], s
 @pytest.mark.parametrize("encoding", ["mono8", "8UC1", "bgr8", "rgb8", "bgra8", "rgba8", "bayer_rggb8", "bayer_gbrg8"])
 def test_frames_of_a_bag_are_grey_whatever_their_encoding(tmp_path: Path, encoding: str):
     channels = {"bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}.get(encoding, 1)
-    # Of a Bayer pattern, a picture that is the same everywhere can be told.
+    # For a Bayer pattern, only a uniform image has a known result.
     grey = np.full_like(GREY, 77) if "bayer" in encoding else GREY
     pixels = np.repeat(grey[..., None], channels, axis=-1).astype(np.uint8)
     found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels))
@@ -416,7 +416,7 @@ def test_frames_of_a_bag_are_grey_whatever_their_encoding(tmp_path: Path, encodi
 
 @pytest.mark.parametrize("encoding", [*BAYER_ON, "rgb8", "bgr8", "rgba8"])
 def test_red_is_taken_for_red(tmp_path: Path, encoding: str):
-    """It makes 30 per cent of grey, blue 11."""
+    """Red contributes 30 % to grey, blue 11 %."""
     if encoding in BAYER_ON:
         pixels, (row, column) = np.zeros((48, 64), np.uint8), BAYER_ON[encoding]
         pixels[row::2, column::2] = 200
@@ -486,7 +486,7 @@ def test_frames_of_another_size_are_left_out_and_counted(tmp_path: Path):
     settings = ProcessSettings(sensor_size=(64, 48))
     said = " ".join(process("ecd", ecd(tmp_path / "source"), tmp_path / "scene", settings))
     assert "left out: 1 frame of 240 x 180 pixels, expected their camera's 64 x 48" in said
-    assert "3 of 3 frames within their span, 2 of which are taken along" in said
+    assert "3 of 3 frames within their span, 2 imported" in said
     assert len(read_scene(tmp_path / "scene").frames) == 2 and inspect_scene(tmp_path / "scene").events == 2000
 
 
@@ -512,7 +512,7 @@ def test_frames_that_cannot_be_read_leave_no_scene_and_are_no_matter_without_fra
 
 
 def stereo_bag(path: Path) -> Path:
-    """Two event cameras, with colour and grey pictures each."""
+    """Two event cameras, each with colour and grey images."""
     store = types(1)
     image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in STEREO)
     with Writer1(path) as bag:
@@ -613,7 +613,7 @@ def test_real_calibrations_of_tum_vie(side: str):
 
 
 def saved(tmp_path: Path, factor: float, dtype: type = int) -> tuple[Path, ProcessSettings]:
-    """Events of 2 s whose times are in another unit, and poses."""
+    """2 s of events with times in another unit, and poses."""
     (tmp_path / "t.txt").write_text(poses("s"))
     np.savez(tmp_path / "a.npz", **columns() | {"t": (columns()["t"] * factor).astype(dtype)})  # pyright: ignore[reportArgumentType]
     return tmp_path / "a.npz", ProcessSettings(trajectory=tmp_path / "t.txt", camera=calibration(tmp_path))

@@ -1,4 +1,4 @@
-"""EVT2, EVT2.1, EVT3 and DAT against writers of their own, and against a real camera's file."""
+"""EVT2, EVT2.1, EVT3 and DAT against independent writers, and against a real camera's file."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def test_what_is_written_is_read_in_pieces_of_any_size(encoding, events: list[wr
 @pytest.mark.parametrize("encoding", list(ENCODERS))
 def test_time_runs_on_where_its_counter_begins_anew(encoding):
     bits = 24 if encoding == "evt3" else 34
-    # As cameras do, with time words now and then.
+    # As from cameras, with occasional time words.
     times = [*range((1 << bits) - 3 * (1 << (bits - 3)), (1 << bits) + 3 * (1 << (bits - 3)), 1 << (bits - 3))]
     content = ENCODERS[encoding]([(t, 1, 2, 1) for t in times])
     assert Decoder(encoding).feed(content)[2].tolist() == times
@@ -80,20 +80,20 @@ def test_reserved_words_of_evt3_are_counted_and_left_out(tmp_path: Path, kinds: 
     padded = np.insert(words, places, np.resize(np.array(kinds, np.uint16), 15))
     source = read_raw(writers.raw(tmp_path / "a.raw", "3.0", padded.tobytes()))
     assert np.concatenate([piece.t_us for piece in source.pieces]).tolist() == [t for t, *_ in events]
-    assert source.dropped["words of reserved kinds, as padding is"] == 15
-    # Much of one padding is padding still; much of everything is no EVT3.
+    assert source.dropped["words of reserved types, such as padding"] == 15
+    # Many words of one padding value are still padding; many diverse ones are not EVT3.
     padded = np.insert(words, np.repeat(places, 100), np.resize(np.array(kinds, np.uint16), 1500))
     source = read_raw(writers.raw(tmp_path / "b.raw", "3.0", padded.tobytes()))
     if len(kinds) == 1:
         assert sum(map(len, source.pieces)) == 300
     else:
-        with pytest.raises(RecordingError, match="no word of EVT3, and .*% are none .*expected the encoding of its"):
+        with pytest.raises(RecordingError, match="not an EVT3 word, like .*% of all .*expected the encoding of its"):
             list(source.pieces)
 
 
 def test_random_words_are_no_evt3(tmp_path: Path):
     content = np.random.default_rng(0).bytes(4000)
-    with pytest.raises(RecordingError, match="no word of EVT3"):
+    with pytest.raises(RecordingError, match="not an EVT3 word"):
         list(read_raw(writers.raw(tmp_path / "a.raw", "3.0", content)).pieces)
 
 
@@ -145,7 +145,7 @@ ECF_EVENTS = st.lists(
 @pytest.mark.parametrize("layout", ["packed", "runs and packed", "runs and masks"])
 @given(events=ECF_EVENTS, far_us=st.integers(0, 1 << 40))
 def test_ecf_blocks_read_back_and_cut_ones_are_refused(layout: str, events: list[writers.Event], far_us: int):
-    # Runs of equal times, of none, and a long silence in the middle.
+    # Runs of equal times, single times, and a long silence in the middle.
     half = len(events) // 2
     made = [(t + (far_us if k >= half else 0), x, y, p) for k, (t, x, y, p) in enumerate(sorted(events))]
     content = writers.ecf(made, layout)

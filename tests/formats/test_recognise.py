@@ -1,4 +1,4 @@
-"""Formats are told from content, and every damage ends in one line."""
+"""Formats are recognised from content, and all damage results in a one-line error."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -201,7 +201,7 @@ def test_a_cut_file_is_an_error_or_the_events_before_the_cut(tmp_path: Path, nam
             assert str(cut) in str(error) and "\n" not in str(error)
             continue
         assert np.array_equal(back.t_us, expected.t_us[: len(back)]) and np.array_equal(back.x, expected.x[: len(back)])
-        # Nothing is missing that the file still holds; formats without lengths cannot know of what was cut off.
+        # All events still in the file are read; formats without lengths cannot detect truncation.
         assert len(back) == len(expected) or name.split(".")[-1] in ("raw", "dat", "txt"), place
 
 
@@ -297,7 +297,7 @@ def test_a_cut_aedat4_is_an_error(tmp_path: Path):
         cut = tmp_path / "cut.aedat4"
         cut.write_bytes(content[:place])
         try:
-            # Behind the last packet there is but a table of contents.
+            # Only a table of contents follows the last packet.
             assert sum(map(len, open_recording(cut).pieces)) == 111_954
         except RecordingError as error:
             assert "cut.aedat4" in str(error)

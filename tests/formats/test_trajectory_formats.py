@@ -1,4 +1,4 @@
-"""One motion, written as every program writes it, is read as one motion."""
+"""One motion, written in the formats of many programs, is read back as the same motion."""
 
 import struct
 from pathlib import Path
@@ -204,7 +204,7 @@ def test_robust_e_nerf(tmp_path: Path):
         ("0 0 0 0 0 0 0 1\n1 0 0\n", "3 columns, expected 8 as before"),
         ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", ":2: time 0 again, expected times that increase"),
         ("0 0 0 0 0 0 0 1\n1e11 0 0 0 0 0 0 1\n", "plausible spacing in no unit"),
-        ("2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, "is no rotation"),
+        ("2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, "is not a rotation"),
     ],
 )
 def test_what_is_no_trajectory_is_named(tmp_path: Path, content: str, words: str):

@@ -1,4 +1,4 @@
-"""Columns by name, first lines with mistakes, times that are equal or in an unknown unit."""
+"""Columns by name, mistakes in the first lines, equal times and unknown time units."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ NS = [str(1000 * t) for t in T_US.tolist()]
 
 
 def table(header: str, *columns: object) -> str:
-    """Comma-separated, below a line of names; a number alone stands for itself in every line."""
+    """Comma-separated rows below a header line; a scalar is repeated in every row."""
     lines = [header]
     for k in range(COUNT):
         cells = []
@@ -170,7 +170,7 @@ def test_arrays_that_are_no_matrices_are_named(tmp_path: Path):
     lost[4, 0, 3] = np.nan
     for content, words in (
         (square.transpose(0, 2, 1), "the last row of matrix 0 is"),
-        (2 * square[:, :3], "the matrix of pose 0 is no rotation"),
+        (2 * square[:, :3], "the matrix of pose 0 is not a rotation"),
         (lost, "pose 4: a number is not finite"),
         (square[0], r"shape \(4, 4\), expected matrices \(poses, 4, 4\)"),
         (square[:5], "12 times, expected one for each of the 5 poses"),
