@@ -20,7 +20,7 @@ from ebarf_ns.formats.source import DECIMALS, TimeUnit
 if TYPE_CHECKING:
     from jaxtyping import Num
 
-TELLING_ROWS = 1 << 16
+SAMPLED_ROWS = 1 << 16
 """Number of events at the beginning and at the end from which order and unit are inferred."""
 ROLES = "txyp"
 _NAMES = {
@@ -79,7 +79,7 @@ def parsed_order(text: str) -> str:
     return order
 
 
-def told_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usual: str) -> tuple[str, str]:
+def inferred_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usual: str) -> tuple[str, str]:
     """Infer the order of four columns and explain it; ``usual`` if the values do not contradict it.
 
     Raises :class:`RecordingError` if the values fit several orders.
@@ -169,10 +169,10 @@ def coarseness(t: Num[np.ndarray, "events"], unit: TimeUnit) -> list[str]:
     ]
 
 
-def telling(columns: Sequence[Any]) -> list[np.ndarray]:
+def sampled(columns: Sequence[Any]) -> list[np.ndarray]:
     """The first and last events of columns that may be on disk."""
     return [
-        np.concatenate([column[:TELLING_ROWS], column[max(TELLING_ROWS, len(column) - TELLING_ROWS) :]])
+        np.concatenate([column[:SAMPLED_ROWS], column[max(SAMPLED_ROWS, len(column) - SAMPLED_ROWS) :]])
         for column in columns
     ]
 

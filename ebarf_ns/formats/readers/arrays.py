@@ -22,13 +22,13 @@ from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
     guessed_unit,
+    inferred_order,
     integers,
     is_whole,
     look_like_events,
     named,
+    sampled,
     spaced,
-    telling,
-    told_order,
     unit_of,
 )
 from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds, numbered
@@ -102,10 +102,10 @@ def _read(
     last = _first_with_events(files[::-1], open_one) if len(files) > 1 else first
     opened = open_one if len(files) > 1 else lambda file: first
     ends = (first, last) if len(files) > 1 else (first,)
-    samples = [np.concatenate(parts) for parts in zip(*(telling(end.columns) for end in ends), strict=True)]
+    samples = [np.concatenate(parts) for parts in zip(*(sampled(end.columns) for end in ends), strict=True)]
     order, notes = "", []
     if first.order is None:
-        order, how = (columns, "as stated") if columns else told_order(path, samples, _ESIM)
+        order, how = (columns, "as stated") if columns else inferred_order(path, samples, _ESIM)
         notes.append(f"columns {spaced(order)}, {how}")
     t = replace(first, columns=tuple(samples)).by_role(order)[2]
     unit = time_unit or first.unit or ("ns" if kind == "npy" and order == _ESIM and _of_esim(t) else guessed_unit(t))
@@ -154,7 +154,7 @@ def _found(path: Path, arrays: Arrays, part: str | None) -> _Found:
     if len(candidates) > 1:
         # Matrices of poses and cameras also have four columns.
         candidates = {
-            name: found for name, found in candidates.items() if found.order or look_like_events(telling(found.columns))
+            name: found for name, found in candidates.items() if found.order or look_like_events(sampled(found.columns))
         } or candidates
     if len(candidates) != 1:
         raise RecordingError(_neither(path, arrays, list(candidates)))

@@ -21,12 +21,12 @@ from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
     guessed_unit,
+    inferred_order,
     integers,
     look_like_events,
     named,
+    sampled,
     spaced,
-    telling,
-    told_order,
     unit_of,
 )
 from ebarf_ns.formats.readers import ecf
@@ -111,11 +111,11 @@ def _order_and_unit(
     """The order of unnamed columns, the time unit, and notes on how they were found."""
     order, notes = "", []
     if events.order is None:
-        order, how = (columns, "as stated") if columns else told_order(path, telling(events.columns), _USUAL)
+        order, how = (columns, "as stated") if columns else inferred_order(path, sampled(events.columns), _USUAL)
         notes.append(f"columns {spaced(order)}, {how}")
     _check(path, name, events.by_role(order))
     time = events.by_role(order)["t"]
-    t = telling([time])[0] if time.dtype.kind == "f" else np.zeros(0, np.int64)
+    t = sampled([time])[0] if time.dtype.kind == "f" else np.zeros(0, np.int64)
     unit = time_unit or unit_of(events.time_name) or guessed_unit(t)
     return order, unit, notes + coarseness(t, unit)
 
@@ -139,7 +139,7 @@ def _groups(file: h5py.File, wanted: str | None) -> dict[str, _Events]:
     if len(found) < 2:
         return found
     # Matrices of poses and cameras also have four columns.
-    return {name: events for name, events in found.items() if look_like_events(telling(events.columns))} or found
+    return {name: events for name, events in found.items() if look_like_events(sampled(events.columns))} or found
 
 
 def _events_of(thing: h5py.Group | h5py.Dataset) -> _Events | None:

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
+from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, inferred_order, spaced
 from ebarf_ns.formats.source import DECIMALS, Piece, Source, TimeUnit
 
 _BLOCK_BYTES = 1 << 22
@@ -93,7 +93,7 @@ def _inferred_order(path: Path, rows: list[list[str]], columns: str | None) -> t
         return columns, (f"columns {spaced(columns)}, as stated",)
     numbers = [[_decimal(field) for field in fields] for fields in rows]
     whole = list(itertools.takewhile(lambda row: len(row) == len(ROLES) and None not in row, numbers))
-    order, how = told_order(path, list(np.array(whole, float).reshape(-1, len(ROLES)).T), ROLES)
+    order, how = inferred_order(path, list(np.array(whole, float).reshape(-1, len(ROLES)).T), ROLES)
     return order, (f"columns {spaced(order)}, {how}",)
 
 
