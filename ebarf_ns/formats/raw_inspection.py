@@ -155,7 +155,7 @@ def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output
 
 
 def print_raw_summary(summary: RawSummary, path: Path) -> None:
-    """For a person: first what looks wrong."""
+    """Print the summary, suspicions first."""
     seconds = (summary.end_us - summary.start_us) * 1e-6
     size = f"{summary.width} x {summary.height}"
     most = max(1, *summary.rate)

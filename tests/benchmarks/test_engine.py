@@ -55,7 +55,7 @@ def test_verdicts():
     assert Figure("x", None, "s", at_most=60).verdict == "not measured" and Figure("x", 1, "s").verdict == ""
 
 
-def test_our_own_code_is_measured_with_torch_numpy_numba_and_h5py_alone(tmp_path: Path):
+def test_our_code_is_measured_with_only_torch_numpy_numba_and_h5py(tmp_path: Path):
     parts = [part for part in PARTS if part not in ("index", "scaling")]
     finished = subprocess.run(
         [sys.executable, "-c", BARE, "--quick", *parts],

@@ -35,7 +35,7 @@ def read(tmp_path: Path, text: str):
     return read_manifest(path)
 
 
-def test_a_manifest_says_what_is_compared(tmp_path: Path):
+def test_a_manifest_defines_the_comparison(tmp_path: Path):
     manifest = read(tmp_path, WHOLE)
     assert manifest.name == "some" and manifest.seeds == (0, 4) and manifest.seconds == (5, 10)
     assert manifest.methods["floor"].words[1:] == ["--pipeline.model.camera-optimizer.mode", "off"]
@@ -100,7 +100,7 @@ def test_shipped_manifests_are_whole(path: Path):
         (WHOLE.replace("  slide:", "  ../slide:"), "a name in scenes is '../slide'"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, complaint: str):
+def test_errors_are_named(tmp_path: Path, text: str, complaint: str):
     with pytest.raises(BenchmarkError, match=complaint):
         read(tmp_path, text)
 

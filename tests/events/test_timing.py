@@ -157,7 +157,7 @@ def test_no_doubles_without_a_gap(speed: float, blind_us: int, jitter_us: float)
     assert doubles(*indexed((pixel, np.maximum(t_us + jitter, 0).astype(np.int64), polarity))) == (0.0, 0)
 
 
-def test_no_doubles_in_edges_that_cross_at_once_nor_in_noise_nor_in_next_to_nothing():
+def test_no_doubles_in_flashes_noise_and_tiny_recordings():
     flash = fired(lambda t: np.full(SHAPE, 2.0 * (t > 0.1) - 2.0 * (t > 0.2)), 0.3)
     assert doubles(*indexed(flash)) == (0.0, 0)
     assert doubles(*indexed(noise(1.0, 1000, 20))) == (0.0, 0)
@@ -185,7 +185,7 @@ def test_flicker_in_short_recordings_and_when_mains_drift(seconds: float):
 
 
 @pytest.mark.parametrize("step_us", [300, 1000, 2000])
-def test_flicker_is_found_with_a_blind_time_and_a_clock_of_steps(step_us: int):
+def test_flicker_is_found_with_a_refractory_period_and_a_stepped_clock(step_us: int):
     light = lit(moving(TEXTURE, 60, 13), 100, 0.3, TENTH)
     pixel, t_us, polarity = fired(light, 1.0, blind_us=500)
     found = flicker_hz(*indexed((pixel, t_us // step_us * step_us, polarity)), clock_step_us=step_us)
@@ -193,7 +193,7 @@ def test_flicker_is_found_with_a_blind_time_and_a_clock_of_steps(step_us: int):
     np.testing.assert_array_equal(found.pixels, TENTH.ravel())
 
 
-def test_a_recording_too_short_to_tell_has_no_flicker():
+def test_a_too_short_recording_has_no_flicker():
     found = flicker_hz(*indexed(fired(lit(moving(TEXTURE, 60), 100, 0.6), 0.19)))
     assert found.hz is None and found.share_of_pixels == 0 and found.pixels.shape == (PIXELS,)
     assert not found.pixels.any()
@@ -219,18 +219,18 @@ def test_a_recording_too_short_to_tell_has_no_flicker():
     ],
 )
 @pytest.mark.parametrize("seconds", [0.3, 1.5])
-def test_what_moves_is_no_flicker(light: Light, seconds: float):
+def test_motion_is_not_flicker(light: Light, seconds: float):
     assert flicker_hz(*indexed(fired(light, seconds))).hz is None
 
 
 @pytest.mark.parametrize(("hz", "pixels"), [(20, PIXELS), (1000, 3), (1000, 300)])
-def test_noise_and_hot_pixels_are_no_flicker(hz: float, pixels: int):
+def test_noise_and_hot_pixels_are_not_flicker(hz: float, pixels: int):
     assert flicker_hz(*indexed(noise(1.0, hz, pixels))).hz is None
 
 
 @pytest.mark.parametrize("step", [1e6 / 3000, 1000, 2000, 10000, 1e6 / 60])
 @pytest.mark.parametrize("speed", [60, 400])
-def test_steps_of_the_clock_are_no_flicker(step: float, speed: float):
+def test_clock_steps_are_not_flicker(step: float, speed: float):
     pixel, t_us, polarity = fired(moving(TEXTURE, speed, 13), 1.0)
     t_us = np.rint(t_us // step * step).astype(np.int64)
     assert flicker_hz(*indexed((pixel, t_us, polarity)), clock_step_us=clock_step_us(t_us)).hz is None
@@ -246,7 +246,7 @@ def test_steps_of_the_clock_are_no_flicker(step: float, speed: float):
         ("photos_dim", 160, 120),
     ],
 )
-def test_recordings_from_elsewhere(name: str, width: int, height: int):
+def test_foreign_recordings(name: str, width: int, height: int):
     path = DATA / name / "events.h5"
     if not path.exists():
         pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")

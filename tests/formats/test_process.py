@@ -207,7 +207,7 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
         assert scene.frames[0].event_camera_from_frame_camera[2][3] == pytest.approx(-0.0044167, abs=1e-6)
 
 
-def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
+def test_a_reference_determines_an_unknown_time_unit(tmp_path: Path):
     source = tumvie(tmp_path / "source")
     lines = [line.split() for line in poses("us").splitlines()]
     permuted = "".join(f"{float(t)} {x} {y} {z} {qy} {qz} {qw} {qx}\n" for t, x, y, z, qx, qy, qz, qw in lines)
@@ -219,7 +219,7 @@ def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
     assert (back * TURNS[0].inv()).magnitude() < 1e-6
 
 
-def test_flags_are_of_the_trajectory_and_leave_the_reference_as_it_says_itself(tmp_path: Path):
+def test_format_flags_apply_to_the_trajectory_and_not_to_the_reference(tmp_path: Path):
     source = tumvie(tmp_path / "source")
     wxyz = [line.split() for line in poses("s").splitlines()]
     lines = "".join(f"{t} {x} {y} {z} {qw} {qx} {qy} {qz}\n" for t, x, y, z, qx, qy, qz, qw in wxyz)
@@ -250,7 +250,7 @@ def test_the_right_camera_of_tum_vie_with_a_calibration_from_elsewhere_and_no_fr
         process("tumvie", source, tmp_path / "other", ProcessSettings(part="middle"))
 
 
-def test_a_calibration_that_is_given_goes_before_the_folders_own(tmp_path: Path):
+def test_a_given_calibration_takes_precedence_over_the_folders_own(tmp_path: Path):
     source = robust(tmp_path / "source")
     (source / "camera_calibration.npz").unlink()
     process("robust-e-nerf", source, tmp_path / "scene", ProcessSettings(camera=calibration(tmp_path)))
@@ -270,7 +270,7 @@ def test_a_calibration_that_is_given_goes_before_the_folders_own(tmp_path: Path)
         (ProcessSettings(events=Intake(start_us=10**9)), "expected --camera"),
     ],
 )
-def test_what_is_missing_is_said_and_leaves_no_folder(tmp_path: Path, settings: ProcessSettings, words: str):
+def test_missing_parts_are_reported_and_leave_no_folder(tmp_path: Path, settings: ProcessSettings, words: str):
     with pytest.raises(EbarfError, match=words):
         process("esim", esim(tmp_path / "source"), tmp_path / "scene", settings)
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
@@ -323,7 +323,7 @@ def test_a_window_between_two_poses_is_a_suspicion(tmp_path: Path):
     assert any("lie between keyframes 0 and 1, 8.33 ms apart: times in another unit?" in one for one in suspicions)
 
 
-def test_a_torn_trajectory_is_said_and_suspected(tmp_path: Path):
+def test_a_discontinuous_trajectory_is_reported_and_suspected(tmp_path: Path):
     lines = [line.split() for line in poses("s").splitlines()]
     text = "".join(" ".join([t, f"{float(x) + 3 * (k > 99)}", *rest]) + "\n" for k, (t, x, *rest) in enumerate(lines))
     for sentences in odometry(tmp_path, text):
@@ -347,7 +347,7 @@ def test_a_zip_is_as_good_as_its_folder(tmp_path: Path):
     assert any("2,000 kept" in sentence for sentence in said)
 
 
-def test_what_goes_wrong_after_unpacking_is_not_the_zips_fault(tmp_path: Path):
+def test_errors_after_unpacking_do_not_blame_the_zip(tmp_path: Path):
     esim(tmp_path / "source")
     shutil.make_archive(str(tmp_path / "source"), "zip", tmp_path, "source")
     (tmp_path / "file").write_text("where a folder should be")
@@ -428,7 +428,7 @@ def test_red_is_taken_for_red(tmp_path: Path, encoding: str):
 
 
 @pytest.mark.parametrize("big", [False, True])
-def test_sixteen_bits_of_which_ten_are_used_are_as_bright_as_they_can_be(tmp_path: Path, big: bool):
+def test_ten_bit_frames_in_sixteen_bits_are_scaled_to_full_range(tmp_path: Path, big: bool):
     pixels = (5 * GREY).astype(">u2" if big else "<u2")
     found, _ = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", "mono16", pixels, big=big))
     assert len(found) == 2 and all((one == 5 * GREY * 2**6).all() and one.dtype == np.uint16 for one in found)
@@ -444,7 +444,7 @@ def test_sixteen_bits_of_which_ten_are_used_are_as_bright_as_they_can_be(tmp_pat
         ("mono8", np.zeros((20, 30), np.uint8), (30, 20), "30 x 20 pixels, expected the event sensor's 64 x 48"),
     ],
 )
-def test_frames_of_a_bag_that_are_not_taken_are_counted(
+def test_skipped_frames_of_a_bag_are_counted(
     tmp_path: Path, encoding: str, pixels: np.ndarray, size: tuple[int, int], words: str
 ):
     found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels, size))
@@ -452,7 +452,7 @@ def test_frames_of_a_bag_that_are_not_taken_are_counted(
 
 
 @pytest.mark.parametrize(("spoilt", "count"), [(False, 2), (True, 0)])
-def test_compressed_frames_of_a_bag_are_taken(tmp_path: Path, spoilt: bool, count: int):
+def test_compressed_frames_of_a_bag_are_read(tmp_path: Path, spoilt: bool, count: int):
     store = types(1)
     image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in COMPRESSED)
     data = cv2.imencode(".png", GREY.astype(np.uint8))[1]
@@ -499,7 +499,7 @@ def test_frames_of_another_size_are_left_out_and_counted(tmp_path: Path):
         ("images.txt", b"\xff\xfe0.1", "images.txt: byte 0 is not UTF-8 text"),
     ],
 )
-def test_frames_that_cannot_be_read_leave_no_scene_and_are_no_matter_without_frames(
+def test_unreadable_frames_leave_no_scene_and_do_not_matter_without_frames(
     tmp_path: Path, name: str, content: bytes, words: str
 ):
     source = ecd(tmp_path / "source")
@@ -531,7 +531,7 @@ def stereo_bag(path: Path) -> Path:
     return path
 
 
-def test_an_equidistant_lens_without_coefficients_is_no_pinhole(tmp_path: Path):
+def test_an_equidistant_lens_without_coefficients_is_not_a_pinhole(tmp_path: Path):
     text = CALIBRATIONS["kalibr.yaml"][0].replace("[0.1, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0]")
     (tmp_path / "kalibr.yaml").write_text(text)
     camera = read_calibration(tmp_path / "kalibr.yaml").camera
@@ -559,7 +559,7 @@ CALIBRATIONS = {
 
 
 @pytest.mark.parametrize("name", list(CALIBRATIONS))
-def test_calibrations_as_others_write_them(tmp_path: Path, name: str):
+def test_foreign_calibrations(tmp_path: Path, name: str):
     text, model = CALIBRATIONS[name]
     (tmp_path / name).write_text(text)
     camera = read_calibration(tmp_path / name).camera
@@ -623,7 +623,7 @@ def saved(tmp_path: Path, factor: float, dtype: type = int) -> tuple[Path, Proce
     ("factor", "dtype", "said", "unit"),
     [(1e-3, int, "us", "ms"), (1e3, int, "us", "ns"), (1e-3, float, "us", "ms"), (1.0, float, "us", "us")],
 )
-def test_a_unit_that_was_guessed_is_checked_beside_the_trajectory(
+def test_a_guessed_unit_is_checked_against_the_trajectory(
     tmp_path: Path, factor: float, dtype: type, said: str, unit: str
 ):
     path, settings = saved(tmp_path, factor, dtype)
@@ -638,7 +638,7 @@ def test_a_unit_that_was_guessed_is_checked_beside_the_trajectory(
     assert not any("suspicious" in sentence for sentence in sentences)
 
 
-def test_a_unit_that_is_stated_is_taken_and_inspection_doubts_it(tmp_path: Path):
+def test_a_stated_unit_is_used_and_doubted_by_inspection(tmp_path: Path):
     path, settings = saved(tmp_path, 1e-3)
     process("auto", path, tmp_path / "scene", replace(settings, event_time_unit="us"))
     (doubt,) = [one for one in inspect_scene(tmp_path / "scene").suspicions if "--event-time-unit" in one]

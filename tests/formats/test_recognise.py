@@ -238,7 +238,7 @@ def test_times_in_nanoseconds_where_hdf5_does_not_say_so(tmp_path: Path):
     assert np.array_equal(back.t_us, writers.recording(EVENTS).t_us)
 
 
-def test_a_file_of_a_ros2_bag_is_as_good_as_its_folder_and_alone_says_what_it_lacks(tmp_path: Path):
+def test_a_file_in_a_ros2_bag_opens_the_bag_and_alone_reports_missing_metadata(tmp_path: Path):
     folder = bag2(tmp_path / "ros2")
     (database,) = folder.glob("*.db3")
     assert np.array_equal(checked(open_recording(database), SIZE).t_us, writers.recording(EVENTS).t_us)
@@ -257,7 +257,7 @@ def test_a_file_of_mcap_is_read_alone(tmp_path: Path):
 
 
 @pytest.mark.parametrize("known", ["npz", "npy"])
-def test_one_kind_of_array_file_taken_for_another_is_named(tmp_path: Path, known: str):
+def test_a_mislabelled_array_file_is_named(tmp_path: Path, known: str):
     path = (npy_file if known == "npz" else npz)(tmp_path / ("a.npy" if known == "npz" else "a.npz"))
     with pytest.raises(RecordingError, match=r"a.np."):
         list(open_recording(path, known).pieces)  # pyright: ignore[reportArgumentType]

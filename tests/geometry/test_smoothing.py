@@ -41,7 +41,7 @@ def test_true_poses_stay_where_they_are():
     assert position < 1e-3 and angle < 1e-3
 
 
-def test_among_few_keyframes_noise_is_seldom_followed():
+def test_few_keyframes_are_rarely_overfitted():
     t_us = torch.arange(17) * 10_000
     still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(17, 1)
     line = Trajectory(t_us, Poses(torch.linspace(0, 0.05, 17, dtype=torch.float64)[:, None] * torch.eye(3)[0], still))

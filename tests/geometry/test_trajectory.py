@@ -69,7 +69,7 @@ def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, fl
     return float(np.abs(found.position.numpy() - true_position).max()), float(off_rad.max())
 
 
-def test_a_spline_follows_a_smooth_motion_that_lines_cut_short():
+def test_a_spline_follows_smooth_motion_better_than_lines():
     lines, splines, finer = (
         np.array(errors_between_keyframes(*what)) for what in (("linear", 20), ("cubic", 20), ("cubic", 40))
     )
@@ -137,7 +137,7 @@ def test_a_delay_is_an_earlier_time_and_has_its_gradient(kind: Interpolation):
 
 
 @given(st.integers(0, 50), st.integers(2, 9), st.integers(1, 100_000), st.sampled_from(["linear", "cubic"]))
-def test_poses_are_inserted_on_the_path_and_those_given_stay(seed: int, count: int, gap_us: int, kind: Interpolation):
+def test_poses_are_inserted_on_the_path_and_given_ones_stay(seed: int, count: int, gap_us: int, kind: Interpolation):
     t_us, poses = keyframes(count, seed)
     dense, given_at = densified(Trajectory(t_us, poses), gap_us + 500, kind)
     assert int(dense.t_us.diff().min()) > 0 and int(dense.t_us.diff().max()) <= gap_us + 501
@@ -148,7 +148,7 @@ def test_poses_are_inserted_on_the_path_and_those_given_stay(seed: int, count: i
     assert torch.allclose(dense.poses.position, between.position, atol=1e-12)
 
 
-def test_no_pose_is_inserted_where_none_is_asked_for():
+def test_no_pose_is_inserted_by_default():
     t_us, poses = keyframes(5)
     for gap_us in (0, 10**9):
         dense, given_at = densified(Trajectory(t_us, poses), gap_us, "linear")

@@ -74,7 +74,7 @@ def test_values_and_table_gradients_agree_on_borders_and_outside(backend: Backen
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
 
-def test_gradients_that_are_still_held_are_never_written_over():
+def test_gradients_in_use_are_never_overwritten():
     grid, point = made(SHAPES[0], "numba"), random_points(200)
     first, second = (torch.autograd.grad(k * grid(point).sum(), grid.table)[0] for k in (1, 2))
     assert torch.allclose(2 * first, second) and first.data_ptr() != second.data_ptr()
@@ -89,14 +89,14 @@ def test_gradients_that_are_still_held_are_never_written_over():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_outside_the_cube_nothing_pulls(backend: Backend):
+def test_position_gradients_vanish_outside_the_cube(backend: Backend):
     point = torch.tensor([[1.5, 0.3, -0.2]], requires_grad=True)
     (gradient,) = torch.autograd.grad(made(SHAPES[0], backend)(point).sum(), point)
     assert gradient[0, 0] == 0 and gradient[0, 2] == 0 and gradient[0, 1] != 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_what_is_not_a_number_shows_and_spoils_nothing_else(backend: Backend):
+def test_nan_points_give_nan_features_and_affect_nothing_else(backend: Backend):
     point = random_points(300)
     point[7, 1], point[11, 0], point[12, 2] = torch.nan, torch.inf, -torch.inf
     encoded = made(SHAPES[0], backend)(point.requires_grad_())
@@ -108,11 +108,11 @@ def test_what_is_not_a_number_shows_and_spoils_nothing_else(backend: Backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_no_points_are_no_features(backend: Backend):
+def test_no_points_give_no_features(backend: Backend):
     assert HashGrid(SHAPES[0], backend)(torch.zeros(0, 3)).shape == (0, 8)
 
 
-def test_position_gradient_is_the_slope():
+def test_position_gradient_matches_finite_differences():
     grid = made(SHAPES[0]).double()
     assert torch.autograd.gradcheck(grid, [random_points(5).double().requires_grad_()], eps=1e-7, atol=1e-5)
 
@@ -123,7 +123,7 @@ def test_levels_grow_from_coarsest_to_finest_and_small_ones_are_dense():
     assert shape.rows == [64, 512, 4096, 4096, 4096]
 
 
-def test_every_cell_within_the_cube_has_both_its_vertices():
+def test_every_cell_in_the_cube_has_both_vertices():
     shape = HashGridShape(levels=6, coarsest=3, finest=50)
     stretch = HashGrid(shape).lattice.stretch.tolist()
     assert all(
@@ -185,7 +185,7 @@ class StandInEncoding(nn.Module):
 
 
 @pytest.mark.parametrize("shape", SHAPES[:2], ids=lambda shape: f"{shape.levels}x{shape.features}")
-def test_our_table_means_the_same_to_tiny_cuda_nn(shape: HashGridShape, monkeypatch: pytest.MonkeyPatch):
+def test_our_table_works_with_tiny_cuda_nn(shape: HashGridShape, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "tinycudann", SimpleNamespace(Encoding=StandInEncoding))
     monkeypatch.setattr("ebarf_ns.radiance.hash_grid._encodings", {})
     grid = made(shape, "tcnn")

@@ -70,7 +70,7 @@ def expected_events(stripes: Stripes, x0: float, speed_m_s: float, level: float)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.05, 0.5, 5.0])
-def test_counts_and_times_of_a_moving_sinusoid_are_those_of_the_closed_form(speed_m_s: float):
+def test_counts_and_times_of_a_moving_sinusoid_match_the_closed_form(speed_m_s: float):
     stripes = Stripes()
     view = view_of(stripes, speed_m_s)
     events = record(view, SENSOR, END_US, 0)
@@ -93,7 +93,7 @@ def test_a_sharp_edge_gives_all_its_events_when_it_passes():
     assert len(events) > 500 and np.bincount(events.x).min() >= 2 * (2 / 0.3 - 1)
 
 
-def test_several_rays_a_pixel_soften_an_edge():
+def test_several_rays_per_pixel_soften_an_edge():
     hard, soft = (
         record(view_of(Stripes(sharp=True, cycles_per_m=0.5), rays_per_pixel=rays), SENSOR, END_US, 0)
         for rays in (1, 4)
@@ -125,7 +125,7 @@ def test_drifting_thresholds_leave_the_order_of_a_pixels_events(drift: float):
         assert runs <= 10
 
 
-def test_a_pixel_is_never_early_after_an_event():
+def test_no_event_falls_in_the_refractory_period():
     events = record(view_of(speed_m_s=5.0), replace(SENSOR, refractory_us=2000.0), END_US, 0)
     gaps = [np.diff(events.t_us[(events.x == x) & (events.y == 1)]).min() for x in range(60)]
     assert min(gaps) >= 1999

@@ -47,7 +47,7 @@ def test_still_light_is_silent(level: float):
     assert (watch(steady, np.arange(50) * 100).t_us >= 4800).all()
 
 
-def test_a_pixel_is_blind_after_an_event_and_then_compares_with_what_it_sees():
+def test_the_refractory_period_resets_the_reference_level():
     curves, t_us = ramps(3)
     events = watch(curves, t_us, replace(CLEAN, refractory_us=5000))
     # The ramp takes 10 ms per threshold, starting at the end of the refractory period.
@@ -55,7 +55,7 @@ def test_a_pixel_is_blind_after_an_event_and_then_compares_with_what_it_sees():
         assert np.allclose(np.diff(events.t_us[events.pixel == pixel]), 15_000)
 
 
-def test_leak_makes_positive_events_of_still_light():
+def test_leak_makes_positive_events_in_constant_light():
     events = watch(np.zeros((101, 50)), np.arange(101) * 100_000.0, replace(CLEAN, leak_hz=0.5))
     assert (events.polarity == 1).all() and len(events.pixel) == pytest.approx(0.5 * 10 * 50, abs=50)
 
@@ -70,7 +70,7 @@ def test_noise_comes_at_its_rate_and_hot_pixels_at_theirs():
     assert (events.polarity > 0).mean() == pytest.approx(0.5, abs=0.05) and np.isnan(events.before).all()
 
 
-def test_a_noise_event_resets_what_a_pixel_compares_with():
+def test_a_noise_event_resets_the_reference_level():
     curves, t_us = ramps(400, height=0.15)
     # Never a whole threshold at once, but occasionally a crossing from a level that noise has shifted.
     quiet, noisy = (watch(curves, t_us, replace(CLEAN, shot_noise_hz=hz)) for hz in (0.0, 50.0))
@@ -78,7 +78,7 @@ def test_a_noise_event_resets_what_a_pixel_compares_with():
     assert 0 < reported.sum() < len(quiet.pixel)
 
 
-def test_thresholds_differ_between_pixels_by_what_was_asked_for():
+def test_threshold_mismatch_has_the_given_size():
     curves, t_us = ramps(2000)
     events = watch(curves, t_us, replace(CLEAN, threshold_mismatch=0.05))
     thresholds = 20.0 / np.bincount(events.pixel, minlength=2000)
@@ -86,7 +86,7 @@ def test_thresholds_differ_between_pixels_by_what_was_asked_for():
     assert thresholds.mean() == pytest.approx(0.2, rel=0.02)
 
 
-def test_thresholds_grow_by_what_was_asked_for():
+def test_threshold_drift_has_the_given_size():
     t_us = np.arange(0, 1_000_001, 1000.0)
     sensor = EventSensor(replace(CLEAN, threshold_drift=0.5), 1e6, 0, np.zeros(1))
     chunks = [sensor.see(np.zeros(1, int), t_us[k : k + 1], 20e-6 * t_us[k : k + 1]) for k in range(1, len(t_us))]
@@ -164,7 +164,7 @@ def test_bandwidth_follows_the_light_and_not_the_leak():
     assert len(same.t_us) > 90 and np.allclose(same.t_us, follows.t_us, atol=1e-3, rtol=0)
 
 
-def test_timestamps_jitter_by_what_was_asked_for_and_stay_within_the_recording():
+def test_timestamp_jitter_has_the_given_size_and_stays_within_the_recording():
     sensor = EventSensor(replace(CLEAN, jitter_us=30.0), 1e6, 0, np.zeros(1))
     t_us = np.linspace(0, 1e6, 20_000)
     jittered = sensor.jitter(t_us)
@@ -172,7 +172,7 @@ def test_timestamps_jitter_by_what_was_asked_for_and_stay_within_the_recording()
     assert (jittered - t_us)[100:-100].std() == pytest.approx(30, rel=0.05)
 
 
-def test_thresholds_that_drift_make_no_events_of_still_light():
+def test_drifting_thresholds_make_no_events_in_constant_light():
     still = np.full((200, 2000), -1.0)
     grows = watch(still, np.arange(200) * 5_000.0, replace(CLEAN, threshold_drift=1.0))
     assert len(grows.pixel) == 0
