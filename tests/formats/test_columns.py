@@ -91,7 +91,7 @@ def test_orders_are_inferred_with_signed_polarities_and_unsorted_times(tmp_path:
     t = events()["t"] + 10**6
     t[[3, 9]] = t[[9, 3]]
     source = open_recording(save(tmp_path / "b.txt", table("xypt", t=t)))
-    assert source.columns == "xypt" and "though times do decrease" in source.notes[0]
+    assert source.columns == "xypt" and "although times decrease" in source.notes[0]
     with pytest.raises(RecordingError, match="--unsorted sort"):
         checked(source, SIZE)
 
@@ -163,7 +163,7 @@ def test_single_precision_times_are_reported_as_coarse(tmp_path: Path, kind: str
     source = open_recording(path)
     report = take_in(source, SIZE, Intake(), tmp_path / "out.h5")
     was = "were" if kind in ("txt", "double") else "are"
-    assert any(f"times {was} float32, which lie 122 us apart at 1504." in line for line in report.sentences())
+    assert any(f"times {was} float32, with a resolution of 122 us at 1504." in line for line in report.sentences())
 
 
 def test_a_folder_of_npz_is_read_by_the_numbers_of_its_files(tmp_path: Path):
