@@ -20,7 +20,7 @@ from ebarf_ns.nerf.dataparser import keep_scene, moved
 from ebarf_ns.nerf.machine import free_threads
 from ebarf_ns.nerf.metrics_file import changed_parts, config_digest, flags_of, scene_digest
 from ebarf_ns.plan import Line, apply_plan, plan_for
-from ebarf_ns.radiance.hash_grid import fastest_carrier
+from ebarf_ns.radiance.hash_grid import fastest_backend
 from ebarf_ns.scene import Scene, check_bounds, read_scene
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def run_header(
         "scene": str(pipeline.scene.folder.resolve()),
         "scene_digest": scene_digest(pipeline.scene),
         "config_digest": config_digest(flags),
-        "hash_grid": fastest_carrier(torch.zeros(0, 3, device=device)),
+        "hash_grid": fastest_backend(torch.zeros(0, 3, device=device)),
         "blind_us": pipeline.datamanager.refractory_us,
         "hot_pixels_left_out": pipeline.datamanager.hot_pixels_left_out,
         "alignment": asdict(alignment) if alignment else None,
