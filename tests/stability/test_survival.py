@@ -64,22 +64,33 @@ def say(line: str) -> None:
     sys.stderr.write(f"\n  {line}\n")
 
 
+def train_and_tell(made: EbarfTrainerConfig, told: int) -> None:
+    """Train, and write a byte after each step; forked in the midst of a test run, there is no way out but the kill."""
+    try:
+        ready = trainer(made)
+        followed = ready.averaging.follow
+
+        def follow(steps_done: int) -> None:
+            followed(steps_done)
+            os.write(told, b"!")
+
+        ready.averaging.follow = follow
+        ready.train()
+    finally:
+        os._exit(1)
+
+
 def test_fifty_kills_lose_nothing(scene: Path, tmp_path: Path, undisturbed: dict[str, torch.Tensor]):
     chance, kills, reached = random.Random(0), 0, []
     while kills < KILLS:
         began, told = os.pipe()
         child = os.fork()
         if child == 0:
-            # Forked in the midst of a test run: nothing but training, and no way out but the kill.
-            try:
-                ready = trainer(resumed(saving(scene, tmp_path)))
-                os.write(told, b"!")
-                ready.train()
-            finally:
-                os._exit(1)
+            train_and_tell(resumed(saving(scene, tmp_path)), told)
         os.close(told)
-        os.read(began, 1)
-        time.sleep(chance.uniform(0.0, 0.3))
+        for _ in range(chance.randint(1, 8)):
+            os.read(began, 1)
+        time.sleep(chance.uniform(0.0, 0.1))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         os.close(began)
