@@ -181,8 +181,9 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_training_goes_on_when_ther
     for size_kib in (300, 500, 900):
         finished = in_namespace(script, disk, scene, tmp_path, size_kib)
         assert finished.returncode == 0, finished.stderr + (tmp_path / "again").read_text()
-        said = (tmp_path / "full").read_text().splitlines()[-1]
-        assert (tmp_path / "code").read_text() == "2\n" and said.startswith("error: ")
+        # Tensorboard's own thread may complain as well.
+        (said,) = [line for line in (tmp_path / "full").read_text().splitlines() if line.startswith("error: /")]
+        assert (tmp_path / "code").read_text() == "2\n"
         assert "No space left on device" in said or "room on the disk" in said
         assert not (tmp_path / "half").read_text()
         end = read_checkpoint(max((tmp_path / "end").rglob("step-*.ckpt")))
@@ -282,7 +283,7 @@ def test_bad_numbers_end_a_run_with_a_good_checkpoint_from_which_it_goes_on(
                     ready.averaging.parameters[0].view(-1)[7] = torch.nan
             else:
                 keyframes, table = model.camera_optimizer.correction, model.renderer.field.grid.table
-                break_gradient(keyframes if where == "pose gradient" else table)
+                break_gradient(keyframes.requires_grad_() if where == "pose gradient" else table)
 
     ready.averaging.follow = then
     with pytest.raises(SystemExit) as stopped:
@@ -309,7 +310,7 @@ def test_another_scene_is_refused(scene: Path, tmp_path: Path, capsys: pytest.Ca
     with pytest.raises(SystemExit) as stopped:
         trainer(resumed(saving(changed, tmp_path, steps=6)))
     said = capsys.readouterr().err.splitlines()[-1]
-    assert stopped.value.code == 2 and "events changed since" in said
+    assert stopped.value.code == 2 and "recording changed since" in said
     say(f"one event's time changed: exit 2; {said[:120]}")
 
 
