@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ebarf_ns.errors import RecordingError, did_you_mean
+from ebarf_ns.files import is_special
 from ebarf_ns.formats.columns import parsed_order
 from ebarf_ns.formats.readers.text import read_text
 from ebarf_ns.formats.source import Source, TimeUnit
@@ -83,6 +84,8 @@ def recognised(path: Path) -> RecordingFormat:
         raise RecordingError(
             f"{path}: a folder without metadata.yaml (ROS 2), .npy or .npz files, expected a recording"
         )
+    if is_special(path):
+        raise RecordingError(f"{path}: a pipe or a device, expected a file")
     try:
         with path.open("rb") as file:
             beginning = file.read(_BEGINNING)

@@ -11,18 +11,10 @@ from ebarf_ns.files import whole_file
 from ebarf_ns.scene import Scene
 
 _NAME = "metrics.jsonl"
-_SAMPLES_OF_EVENTS = 64
+_SAMPLES, _SAMPLE_BYTES = 1 << 13, 1 << 13
 _PLACES = {
-    "threads",
-    "timestamp",
-    "output_dir",
-    "experiment_name",
-    "load_dir",
-    "load_step",
-    "load_checkpoint",
-    "data",
-    "kept",
-}
+    "threads", "timestamp", "output_dir", "experiment_name", "load_dir", "load_step", "load_checkpoint", "data", "kept",
+}  # fmt: skip
 
 
 def begin_metrics(run: Path, header: Callable[[], dict[str, Any]], start_step: int) -> None:
@@ -52,16 +44,19 @@ def read_header(run: Path) -> dict[str, Any]:
 
 
 def scene_digest(scene: Scene) -> dict[str, str]:
-    """What tells whether a scene is still the same, part by part; of the events, their size and a sample of them."""
+    """What tells whether a scene is still the same, part by part.
+
+    Of a recording of more than 64 MiB, its size and as much, taken from all over it.
+    """
     size = scene.events.stat().st_size
     events = sha256(str(size).encode())
     with scene.events.open("rb") as file:
-        for k in range(_SAMPLES_OF_EVENTS):
-            file.seek(k * size // _SAMPLES_OF_EVENTS)
-            events.update(file.read(4096))
+        for k in range(_SAMPLES):
+            file.seek(k * max(size // _SAMPLES, _SAMPLE_BYTES))
+            events.update(file.read(_SAMPLE_BYTES))
     small = {"scene.json": scene.folder / "scene.json", "trajectory": scene.trajectory}
     digests = {part: _digest(path.read_bytes()) for part, path in small.items()}
-    return {**digests, "events": events.hexdigest()[:16]}
+    return {**digests, "recording": events.hexdigest()[:16]}
 
 
 def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
@@ -70,7 +65,7 @@ def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
     if not isinstance(before, dict):
         return []
     now = scene_digest(scene)
-    return [part for part in now if before.get(part) != now[part]]
+    return [part for part in now if part in before and before[part] != now[part]]
 
 
 def flags_of(configuration: Any) -> dict[str, Any]:

@@ -252,7 +252,7 @@ def test_a_script_that_opens_a_run_takes_the_newest_whole_checkpoint_and_says_wh
     assert path == older and step == 2
     found = capsys.readouterr()
     assert f"{newest.name}:isdamaged" in "".join(found.out.split())
-    assert f"{scene}: events changed since" in found.err
+    assert f"{scene}: recording changed since" in found.err
     older.write_bytes(b"")
     with pytest.raises(SystemExit) as stopped:
         eval_setup(ready.base_dir / "config.yml", test_mode="test")

@@ -64,42 +64,77 @@ def say(line: str) -> None:
     sys.stderr.write(f"\n  {line}\n")
 
 
-def test_fifty_kills_lose_nothing(scene: Path, tmp_path: Path, undisturbed: dict[str, torch.Tensor]):
-    chance, kills, reached = random.Random(0), 0, []
-    while kills < KILLS:
+def train_and_tell(made: EbarfTrainerConfig, told: int) -> None:
+    """Train in a forked process, with a byte written after each step."""
+    code = 99
+    try:
+        ready = trainer(made)
+        followed = ready.averaging.follow
+
+        def follow(steps_done: int) -> None:
+            followed(steps_done)
+            os.write(told, b"!")
+
+        ready.averaging.follow = follow
+        ready.train()
+        code = 0
+    except SystemExit as stopped:
+        code = stopped.code if isinstance(stopped.code, int) else 99
+    finally:
+        os._exit(code)
+
+
+def disturb(scene: Path, output: Path, number: int, times: int) -> None:
+    """Send a signal to one training after the other, a few steps after it has gone on; print what became of them.
+
+    In a process that trains nothing itself: one that has run OpenMP may not be forked.
+    """
+    chance, codes, reached, damages = random.Random(number), [], [-1], 0
+    while len(codes) < times and reached[-1] < STEPS - 20:
         began, told = os.pipe()
         child = os.fork()
         if child == 0:
-            # Forked in the midst of a test run: nothing but training, and no way out but the kill.
-            try:
-                ready = trainer(resumed(saving(scene, tmp_path)))
-                os.write(told, b"!")
-                ready.train()
-            finally:
-                os._exit(1)
+            train_and_tell(resumed(saving(scene, output)), told)
         os.close(told)
-        os.read(began, 1)
-        time.sleep(chance.uniform(0.0, 0.3))
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        for _ in range(chance.randint(1, 8)):
+            os.read(began, 1)
+        time.sleep(chance.uniform(0.0, 0.1))
+        os.kill(child, number)
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
         os.close(began)
-        kills += 1
-        folder = saving(scene, tmp_path).get_checkpoint_dir()
+        folder = saving(scene, output).get_checkpoint_dir()
         if any(folder.glob("step-*.ckpt")):
             path, damaged = newest_whole(folder)
-            assert not damaged
+            damages += len(damaged)
             reached.append(read_checkpoint(path)["step"])
-            if reached[-1] > STEPS - 50:
-                break
-    assert reached == sorted(reached)
+    sys.stdout.write(json.dumps({"codes": codes, "reached": reached, "damages": damages}))
+
+
+DISTURB = "import sys; from pathlib import Path; from tests.stability.test_survival import disturb; "
+DISTURB += "disturb(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))"
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "times"), [(signal.SIGKILL, -9, KILLS), (signal.SIGINT, 130, 10), (signal.SIGTERM, 143, 10)]
+)
+def test_signals_at_random_moments_lose_nothing(
+    scene: Path, tmp_path: Path, undisturbed: dict[str, torch.Tensor], number: signal.Signals, code: int, times: int
+):
+    command = [sys.executable, "-c", DISTURB, scene, tmp_path, str(int(number)), str(times)]
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    found = json.loads(finished.stdout.splitlines()[-1])
+    codes, reached = found["codes"], found["reached"]
+    assert set(codes) == {code} and found["damages"] == 0
+    assert reached == sorted(reached) and reached[-1] > len(codes) / 2
     ready = trainer(resumed(saving(scene, tmp_path)))
     ready.train()
     assert same(state(ready), undisturbed)
     run = ready.base_dir
     assert not [path for path in run.rglob(".*") if path.name != ".lock"]
     steps = [json.loads(line)["step"] for line in (run / "metrics.jsonl").read_text().splitlines()[1:]]
-    assert steps == [STEPS // 2, STEPS]
-    say(f"{kills} SIGKILLs, up to step {reached[-1]}: no checkpoint damaged, the end bitwise as undisturbed")
+    assert steps[-1] == STEPS and STEPS // 2 in steps
+    say(f"{len(codes)} times {number.name}, up to step {reached[-1]}: exit code {code}, no checkpoint damaged, ")
+    say("the end is bitwise that of an undisturbed run")
 
 
 FULL_DISK = """
@@ -146,8 +181,9 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_training_goes_on_when_ther
     for size_kib in (300, 500, 900):
         finished = in_namespace(script, disk, scene, tmp_path, size_kib)
         assert finished.returncode == 0, finished.stderr + (tmp_path / "again").read_text()
-        said = (tmp_path / "full").read_text().splitlines()[-1]
-        assert (tmp_path / "code").read_text() == "2\n" and said.startswith("error: ")
+        # Tensorboard's own thread may complain as well.
+        (said,) = [line for line in (tmp_path / "full").read_text().splitlines() if line.startswith("error: /")]
+        assert (tmp_path / "code").read_text() == "2\n"
         assert "No space left on device" in said or "room on the disk" in said
         assert not (tmp_path / "half").read_text()
         end = read_checkpoint(max((tmp_path / "end").rglob("step-*.ckpt")))
@@ -247,7 +283,7 @@ def test_bad_numbers_end_a_run_with_a_good_checkpoint_from_which_it_goes_on(
                     ready.averaging.parameters[0].view(-1)[7] = torch.nan
             else:
                 keyframes, table = model.camera_optimizer.correction, model.renderer.field.grid.table
-                break_gradient(keyframes if where == "pose gradient" else table)
+                break_gradient(keyframes.requires_grad_() if where == "pose gradient" else table)
 
     ready.averaging.follow = then
     with pytest.raises(SystemExit) as stopped:
@@ -274,7 +310,7 @@ def test_another_scene_is_refused(scene: Path, tmp_path: Path, capsys: pytest.Ca
     with pytest.raises(SystemExit) as stopped:
         trainer(resumed(saving(changed, tmp_path, steps=6)))
     said = capsys.readouterr().err.splitlines()[-1]
-    assert stopped.value.code == 2 and "events changed since" in said
+    assert stopped.value.code == 2 and "recording changed since" in said
     say(f"one event's time changed: exit 2; {said[:120]}")
 
 
@@ -300,36 +336,6 @@ def test_of_two_trainings_in_one_folder_one_ends_at_once(scene: Path, tmp_path: 
     end = read_checkpoint(max((tmp_path / "x").rglob("step-*.ckpt")))
     assert end["step"] == STEPS - 1 and averaged(undisturbed, end)
     say(f"two trainings in one folder: exit 0 and 2; {loser[:100]}")
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_at_any_moment_lose_nothing(
-    scene: Path, tmp_path: Path, undisturbed: dict, number: signal.Signals, code: int
-):
-    chance, codes = random.Random(int(number)), []
-    for _ in range(8):
-        child = os.fork()
-        if child == 0:
-            try:
-                trainer(resumed(saving(scene, tmp_path, every=1000))).train()
-            except SystemExit as stopped:
-                os._exit(stopped.code if isinstance(stopped.code, int) else 1)
-            except BaseException:
-                os._exit(99)
-            os._exit(0)
-        time.sleep(chance.uniform(0.3, 4.0))
-        os.kill(child, number)
-        _, status = os.waitpid(child, 0)
-        codes.append(os.waitstatus_to_exitcode(status))
-        if codes[-1] in (0, 2):
-            break
-    # It may have ended before the signal: then its budget is used up.
-    assert set(codes) <= {code, 0, 2} and codes[0] == code
-    if codes[-1] == code:
-        trainer(resumed(saving(scene, tmp_path))).train()
-    end = read_checkpoint(max((tmp_path / "x").rglob("step-*.ckpt")))
-    assert end["step"] == STEPS - 1 and averaged(undisturbed, end)
-    say(f"{number.name} at {len(codes)} moments: exit codes {codes}; the end bitwise that of an undisturbed run")
 
 
 def resident_mib() -> float:
