@@ -220,6 +220,18 @@ def frame_cameras(frames: list[Frame], event_camera: Trajectory, mount_scale: fl
     )
 
 
+def replace_intrinsics(cameras: Cameras, given: Camera, learned: Camera) -> None:
+    """Give those of the cameras that are the event camera, by its intrinsics as given, the intrinsics learned."""
+    one = Trajectory(torch.zeros(1, dtype=torch.int64), Poses(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])))
+    before, after = (_nerfstudio_cameras([camera], one.t_us, one.poses.matrix()) for camera in (given, learned))
+    columns = ("fx", "fy", "cx", "cy", "width", "height")
+    same = torch.cat([getattr(cameras, name) == getattr(before, name) for name in columns], dim=-1).all(dim=-1)
+    for name in ("fx", "fy", "cx", "cy", "distortion_params"):
+        column, new = getattr(cameras, name), getattr(after, name)
+        if column is not None and new is not None:
+            setattr(cameras, name, torch.where(same[:, None], new.to(column), column))
+
+
 def _nerfstudio_cameras(
     cameras: list[Camera], t_us: Int64[Tensor, "cameras"], camera_to_world: Float[Tensor, "cameras 3 4"]
 ) -> Cameras:

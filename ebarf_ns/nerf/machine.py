@@ -27,7 +27,7 @@ def free_threads() -> Threads:
     Threads that wait for each other spin. Where one of them has to share its core, all the others wait for it, and a
     step takes twenty times as long as with one thread less.
     """
-    most = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    most = min(torch.get_num_threads(), numba.get_num_threads())
     if "OMP_NUM_THREADS" in os.environ:
         return Threads(most, "OMP_NUM_THREADS says so")
     before = psutil.Process().cpu_times()

@@ -12,7 +12,7 @@ from ebarf_ns.nerf.machine import Threads, free_threads, use_threads
 def two_cores(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
 
 
 @pytest.mark.parametrize(
