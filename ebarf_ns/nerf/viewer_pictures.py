@@ -127,8 +127,10 @@ def curves(records: Sequence[dict[str, Any]], width: int = 2 * 300) -> bytes:
         axes.set_facecolor("#1a1a1a")
         axes.tick_params(which="both", colors="#bbbbbb", labelsize=13)
         axes.grid(color="#3a3a3a")
-        axes.set_yscale(scale)
-        if scale == "linear":
+        heights = [height for line in axes.lines for height in line.get_ydata()]
+        if scale == "log" and heights and 0 < 10 * min(heights) < max(heights):
+            axes.set_yscale("log")
+        else:
             axes.set_ylim(bottom=0)
     if rows[-1].lines:
         rows[-1].legend(fontsize=13, labelcolor="#dddddd", facecolor="#242424", edgecolor="#3a3a3a")
