@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
+from ebarf_ns.cli.replay import Replay
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
 from ebarf_ns.formats.process import Format, ProcessSettings
 from ebarf_ns.formats.source import TimeUnit
@@ -341,6 +342,7 @@ def entrypoint() -> None:
                 "trajectory": Trajectory,
                 "evaluate": Evaluate,
                 "bench": Bench,
+                "replay": Replay,
             },
             description=__doc__,
             args=_with_config(sys.argv[1:]),

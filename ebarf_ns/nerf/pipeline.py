@@ -1,5 +1,6 @@
 """Training steps and evaluation of a model on its scene."""
 
+import sys
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch import Tensor
 
@@ -23,8 +23,8 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.nerf.checkpoints import unsealed
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras, replace_intrinsics
+from ebarf_ns.nerf.metrics_file import changed_parts, read_header
 from ebarf_ns.nerf.model import EbarfModel
-from ebarf_ns.nerf.viewer_panel import ViewerPanel
 from ebarf_ns.scene import Frame, Scene
 
 # nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
@@ -52,9 +52,10 @@ class EbarfPipeline(VanillaPipeline):
             super().__init__(*args, **kwargs)
             if self.test_mode == "val":
                 self._check_references()
+            else:
+                self._say_what_changed()
         self.last_loss: Tensor | None = None
         """Of the last training step's event pairs."""
-        self.viewer_panel = ViewerPanel(self)
         self.register_buffer("cost", torch.zeros(2, dtype=torch.float64))
         self.cost: Tensor
 
@@ -70,6 +71,13 @@ class EbarfPipeline(VanillaPipeline):
         if self.scene.groundtruth:
             read_tum(self.scene.groundtruth)
 
+    def _say_what_changed(self) -> None:
+        """To evaluate or show a run by another scene than it was trained on may be right, and may be a mistake."""
+        kept = self.datamanager.config.dataparser.kept  # pyright: ignore[reportAttributeAccessIssue]
+        if kept and self.scene.events.is_file() and self.scene.folder != kept:
+            for part in changed_parts(self.scene, read_header(kept.parent)):
+                sys.stderr.write(f"{self.scene.folder}: {part} changed since {kept.parent} was trained\n")
+
     @property
     def scene(self) -> Scene:
         """The scene folder."""
@@ -83,20 +91,17 @@ class EbarfPipeline(VanillaPipeline):
     def _mount_scale(self) -> float:
         return self.datamanager.train_dataset.metadata["mount_scale"]
 
+    @property
+    def seed(self) -> int:
+        """Of this process among those that train together."""
+        return self.datamanager.config.seed * self.world_size + self.datamanager.rank
+
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
-        self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.rank)
+        self.model.begin_step(step, self.seed)
         outputs, losses, metrics = super().get_train_loss_dict(step)
         self.last_loss = losses["event_loss"].detach()
         return outputs, losses, metrics
-
-    def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
-        """The viewer is told of every step."""
-        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
-        shown = TrainingCallback(after, self.viewer_panel.after_step)
-        return [*super().get_training_callbacks(training_callback_attributes), shown]
 
     def trajectory(self, refined: bool = True) -> Trajectory:
         """The keyframes, refined or as they came, in the input's world frame and scale."""

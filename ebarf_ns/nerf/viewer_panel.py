@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, rotate
 from ebarf_ns.geometry.trajectory import Poses
+from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.viewer_pictures import curves, half_window_us, recorded, rendered, side_by_side
 from ebarf_ns.nerf.viewer_scene import SCALE, DrawnScene, vertical_fov_rad
 
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
     from torch import Tensor
 
-    from ebarf_ns.nerf.pipeline import EbarfPipeline
 
 # A chore that took a second comes again after so many.
 _REST, _LEAST_REST_S = 50.0, 1.0
@@ -300,3 +301,19 @@ class ViewerPanel(ViewerControl):
 
 def _as_markdown(png: bytes) -> str:
     return f"![](data:image/png;base64,{base64.b64encode(png).decode()})"
+
+
+class ViewedPipeline(EbarfPipeline):
+    """The pipeline with a panel in nerfstudio's viewer."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.viewer_panel = ViewerPanel(self)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """The viewer is told of every step."""
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        shown = TrainingCallback(after, self.viewer_panel.after_step)
+        return [*super().get_training_callbacks(training_callback_attributes), shown]

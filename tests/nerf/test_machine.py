@@ -12,7 +12,7 @@ from ebarf_ns.nerf.machine import Threads, free_threads, use_threads
 def two_cores(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_torch_and_numba_follow(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.undo()
     before = torch.get_num_threads(), numba.get_num_threads()
     try:
-        use_threads(Threads(1, ""))
+        use_threads(1)
         assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
     finally:
         torch.set_num_threads(before[0])

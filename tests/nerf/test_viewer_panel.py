@@ -55,7 +55,7 @@ def client(training: EbarfTrainer) -> Iterator[ViewerClient]:
 
 
 def test_nothing_is_read_or_drawn_before_somebody_looks(training: EbarfTrainer):
-    panel = training.pipeline.viewer_panel
+    panel: Any = training.pipeline.viewer_panel
     started = time.perf_counter()
     for step in range(1000):
         panel.after_step(step)
