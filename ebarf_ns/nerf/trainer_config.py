@@ -8,7 +8,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import one_line_errors
 from ebarf_ns.nerf.checkpoints import newest_whole
-from ebarf_ns.nerf.settings_check import check_machine
+from ebarf_ns.nerf.settings_check import check_machine, check_settings
 
 
 @dataclass
@@ -30,16 +30,17 @@ class EbarfTrainerConfig(TrainerConfig):
     averaged_steps: int = 100
     """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
 
+    threads: int | None = None
+    """Of torch and numba; None: one for each core that nothing else keeps busy, or as OMP_NUM_THREADS says."""
+
     def save_config(self) -> None:
         """Look whether this machine has what is asked of it, which ns-train begins with.
 
         The trainer writes config.yml, when it has the folder for itself and a plan.
         """
         with one_line_errors():
+            check_settings(self)
             check_machine(self.machine)
-
-    threads: int | None = None
-    """Of torch and numba; None: one for each core that nothing else keeps busy, or as OMP_NUM_THREADS says."""
 
     def print_to_terminal(self) -> None:
         """Config.yml has all of it; what matters is said as the plan."""
