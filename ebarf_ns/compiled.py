@@ -13,9 +13,9 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
     def compiled(function: Function) -> Function:
         try:
-            return numba.njit(**options)(function)
+            return numba.njit(**options)(function)  # pyright: ignore
         except RuntimeError:
             # A container's root may be read-only, with no home.
-            return numba.njit(**{**options, "cache": False})(function)
+            return numba.njit(**{**options, "cache": False})(function)  # pyright: ignore
 
     return compiled

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
 
-from ebarf_ns.checked_json import CheckedObject, is_number, read_json
-from ebarf_ns.errors import SceneError
-from ebarf_ns.files import whole_file
+from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
+from ebarf_ns.json_file import JsonObject, is_number, read_json, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -75,20 +73,26 @@ class Scene:
     """Of the photoreceptor's low pass, at the mean log brightness of what is seen."""
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner in world units."""
+    missing: tuple[Path, ...] = ()
+    """Files of validation frames that are named and are not there; such frames, or depths, are left out."""
 
 
 def read_scene(folder: Path) -> Scene:
-    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation."""
+    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation.
+
+    Validation frames may be missing: nothing is learned from them.
+    """
     path = folder / "scene.json"
     if not folder.is_dir():
-        raise SceneError(f"{folder}: no such folder, expected a scene folder with scene.json in it")
-    content = CheckedObject(path, "", read_json(path))
+        what = "a file" if folder.exists() else "no such folder"
+        raise SceneError(f"{folder}: {what}, expected a scene folder with scene.json in it{did_you_mean(folder)}")
+    content = JsonObject(path, "", read_json(path))
     content.only(_KEYS.split())
     content.choice("format", (FORMAT,))
     if content.integer("version", positive=True) > VERSION:
         raise content.wrong("version", f"at most {VERSION}: a newer ebarf_ns made it")
     camera = _camera(content.object("camera"))
-    frames = content.optional_file("frames")
+    frames, missing = _read_frames(content.optional_file("frames", must_exist=False), camera)
     return Scene(
         folder=folder,
         # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
@@ -96,7 +100,8 @@ def read_scene(folder: Path) -> Scene:
         trajectory=content.file("trajectory"),
         camera=camera,
         groundtruth=content.optional_file("groundtruth"),
-        frames=_read_frames(frames, camera) if frames else (),
+        frames=frames,
+        missing=missing,
         contrast_threshold=_threshold(content.object("contrast_threshold"))
         if content.get("contrast_threshold") is not None
         else None,
@@ -136,7 +141,8 @@ def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajector
     if start_us > last_us or end_us < first_us:
         raise SceneError(
             f"{scene.events}: none of the events, {start_us} to {end_us} us, lies within the span of "
-            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}"
+            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}; ebarf process "
+            f"--time-offset-us {first_us - start_us} would let both begin together"
         )
     if among < 2 and last_us - first_us > _LONGEST_SPAN_RATIO * max(end_us - start_us, 1):
         raise SceneError(
@@ -161,8 +167,8 @@ def write_scene(scene: Scene) -> None:
         "bounds": scene.bounds,
     }
     if scene.frames:
-        _write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
-    _write_json(scene.folder / "scene.json", content)
+        write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
+    write_json(scene.folder / "scene.json", content)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -172,7 +178,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_camera(path: Path, camera: Camera) -> None:
     """Write a camera as ``scene.json`` has it under "camera"."""
-    _write_json(path, _camera_json(camera))
+    write_json(path, _camera_json(camera))
 
 
 def _camera_json(camera: Camera) -> dict[str, Any]:
@@ -194,12 +200,7 @@ def _frame_json(frame: Frame, scene: Scene) -> dict[str, Any]:
     return content
 
 
-def _write_json(path: Path, content: object) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _camera(content: CheckedObject) -> Camera:
+def _camera(content: JsonObject) -> Camera:
     content.only("model width height fx fy cx cy distortion".split())
     model = content.choice("model", tuple(COEFFICIENTS))
     distortion = content.get("distortion") or []
@@ -229,7 +230,7 @@ def _camera(content: CheckedObject) -> Camera:
     )
 
 
-def _threshold(content: CheckedObject) -> ContrastThreshold:
+def _threshold(content: JsonObject) -> ContrastThreshold:
     content.only(["on", "off"])
     for key in ("on", "off"):
         if not 1 / _MOST_THRESHOLD <= content.number(key, positive=True) <= _MOST_THRESHOLD:
@@ -237,21 +238,21 @@ def _threshold(content: CheckedObject) -> ContrastThreshold:
     return ContrastThreshold(content.number("on"), content.number("off"))
 
 
-def _refractory_us(content: CheckedObject) -> int:
+def _refractory_us(content: JsonObject) -> int:
     value = content.integer("refractory_us")
     if not 0 <= value <= _LONGEST_REFRACTORY_US:
         raise content.wrong("refractory_us", f"whole microseconds from 0 to {_LONGEST_REFRACTORY_US}")
     return value
 
 
-def _time_constant_us(content: CheckedObject) -> float:
+def _time_constant_us(content: JsonObject) -> float:
     value = content.number("time_constant_us")
     if not 0 <= value <= _LONGEST_TIME_CONSTANT_US:
         raise content.wrong("time_constant_us", f"microseconds from 0 to {_LONGEST_TIME_CONSTANT_US}")
     return value
 
 
-def _bounds(content: CheckedObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _bounds(content: JsonObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
     bounds = content.get("bounds")
     expected = "two corners [[x, y, z], [x, y, z]], the first below the second on every axis"
     if not isinstance(bounds, list) or len(bounds) != 2:
@@ -267,14 +268,21 @@ def _bounds(content: CheckedObject) -> tuple[tuple[float, ...], tuple[float, ...
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def _read_frames(path: Path, event_camera: Camera) -> tuple[Frame, ...]:
+def _read_frames(path: Path | None, event_camera: Camera) -> tuple[tuple[Frame, ...], tuple[Path, ...]]:
+    """Those that are there, and the files that are not."""
+    if path is None or not path.exists():
+        return (), (path,) if path else ()
     content = read_json(path)
     if not isinstance(content, list):
         raise SceneError(f"{path}: holds a {type(content).__name__}, expected a list of frames")
-    return tuple(_frame(CheckedObject(path, f"[{k}]", item), event_camera) for k, item in enumerate(content))
+    frames = [_frame(JsonObject(path, f"[{k}]", item), event_camera) for k, item in enumerate(content)]
+    named = [file for frame in frames for file in (frame.path, frame.depth) if file]
+    missing = tuple(file for file in named if not file.is_file())
+    present = [frame for frame in frames if frame.path not in missing]
+    return tuple(replace(one, depth=None) if one.depth in missing else one for one in present), missing
 
 
-def _frame(content: CheckedObject, event_camera: Camera) -> Frame:
+def _frame(content: JsonObject, event_camera: Camera) -> Frame:
     content.only("file t_us camera event_camera_from_frame_camera intensity depth".split())
     extrinsic = content.get("event_camera_from_frame_camera")
     if extrinsic is not None:
@@ -284,10 +292,10 @@ def _frame(content: CheckedObject, event_camera: Camera) -> Frame:
     if abs(content.integer("t_us")) > _LATEST_US:
         raise content.wrong("t_us", f"microseconds within ±{_LATEST_US}")
     return Frame(
-        path=content.file("file"),
+        path=content.file("file", must_exist=False),
         t_us=content.integer("t_us"),
         camera=_camera(content.object("camera")) if content.get("camera") is not None else event_camera,
         event_camera_from_frame_camera=tuple(tuple(map(float, row)) for row in extrinsic or np.eye(4).tolist()),
         intensity=content.choice("intensity", get_args(FrameIntensity)),
-        depth=content.optional_file("depth"),
+        depth=content.optional_file("depth", must_exist=False),
     )

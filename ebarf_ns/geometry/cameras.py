@@ -1,8 +1,8 @@
-"""From pixel to bearing: the camera models of the datasets and their inverse."""
+"""The camera models of the datasets: projection and unprojection to bearing vectors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 CameraModel = Literal["pinhole", "radtan", "equidistant"]
+Crop = tuple[int, int, int, int]
+"""(left, top, right, bottom) in pixels; right and bottom are exclusive."""
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 
 
@@ -41,7 +43,7 @@ class Camera:
         return torch.stack([x, y], dim=-1).double()
 
     def bearings(self, pixel: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-        """Unit viewing directions of pixels, in the camera's OpenCV frame, float64."""
+        """Unit viewing directions of pixels in the camera's OpenCV frame, float64."""
         distorted = (pixel.double() - self._centre) / self._focal
         if self.model == "equidistant":
             return _equidistant_bearings(distorted, self.distortion)
@@ -68,8 +70,14 @@ class Camera:
         return torch.tensor([self.cx, self.cy], dtype=torch.float64)
 
 
+def cropped(camera: Camera, crop: Crop) -> Camera:
+    """The camera of the cropped image."""
+    left, top, right, bottom = crop
+    return replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+
+
 def distort_radtan(plane: Float[Tensor, "*batch 2"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch 2"]:
-    """Brown's model: (k1, k2, p1, p2[, k3]), numbers or tensors, of points at distance 1."""
+    """Apply Brown's model with (k1, k2, p1, p2[, k3]), numbers or tensors, to normalised image coordinates."""
     k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
     x, y = plane.unbind(-1)
     r2 = x * x + y * y
@@ -84,7 +92,7 @@ def distort_radtan(plane: Float[Tensor, "*batch 2"], coefficients: Sequence[Any]
 
 
 def _undistort_radtan(distorted: Tensor, coefficients: tuple[float, ...], iterations: int = 20) -> Tensor:
-    """Newton's method on the distortion; its Jacobian is 2x2 and comes from autograd's vector products."""
+    """Invert the distortion by Newton's method; the 2x2 Jacobian comes from autograd."""
     plane = distorted.clone()
     for _ in range(iterations):
         with torch.enable_grad():
@@ -96,7 +104,7 @@ def _undistort_radtan(distorted: Tensor, coefficients: tuple[float, ...], iterat
 
 
 def equidistant_radius(angle_rad: Float[Tensor, "*batch"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch"]:
-    """Kannala and Brandt's distance from the centre, for (k1, k2, k3, k4), numbers or tensors."""
+    """Kannala and Brandt's image radius for (k1, k2, k3, k4), numbers or tensors."""
     k1, k2, k3, k4 = coefficients
     a2 = angle_rad * angle_rad
     return angle_rad * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))

@@ -12,7 +12,9 @@ from ebarf_ns.scene import Scene
 
 _NAME = "metrics.jsonl"
 _SAMPLES, _SAMPLE_BYTES = 1 << 13, 1 << 13
-_PLACES = {"timestamp", "output_dir", "experiment_name", "load_dir", "load_step", "load_checkpoint", "data", "kept"}
+_PLACES = {
+    "threads", "timestamp", "output_dir", "experiment_name", "load_dir", "load_step", "load_checkpoint", "data", "kept",
+}  # fmt: skip
 
 
 def begin_metrics(run: Path, header: Callable[[], dict[str, Any]], start_step: int) -> None:

@@ -17,9 +17,10 @@ from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.dataparser import keep_scene, moved
+from ebarf_ns.nerf.machine import free_threads
 from ebarf_ns.nerf.metrics_file import changed_parts, config_digest, flags_of, scene_digest
 from ebarf_ns.plan import Line, apply_plan, plan_for
-from ebarf_ns.radiance.hash_grid import fastest_carrier
+from ebarf_ns.radiance.hash_grid import fastest_backend
 from ebarf_ns.scene import Scene, check_bounds, read_scene
 
 if TYPE_CHECKING:
@@ -68,6 +69,8 @@ def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str,
     normalized = model.loss == "normalized"
     kind = "cuda" if device.startswith("cuda") else "cpu"
     lines = plan_for(scene, start, events, kind, model.grid_coarsest, model.grid_finest, normalized, facts)
+    threads = free_threads()
+    lines.append(Line("threads", threads.count, threads.reason))
     resumed = {
         field: Line(field, made["value"], "as in the run resumed") for field, made in header.get("plan", {}).items()
     }
@@ -100,7 +103,7 @@ def run_header(
         "scene": str(pipeline.scene.folder.resolve()),
         "scene_digest": scene_digest(pipeline.scene),
         "config_digest": config_digest(flags),
-        "hash_grid": fastest_carrier(torch.zeros(0, 3, device=device)),
+        "hash_grid": fastest_backend(torch.zeros(0, 3, device=device)),
         "blind_us": pipeline.datamanager.refractory_us,
         "hot_pixels_left_out": pipeline.datamanager.hot_pixels_left_out,
         "alignment": asdict(alignment) if alignment else None,

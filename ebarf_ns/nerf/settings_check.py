@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import sys
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from ebarf_ns.errors import TrainingError
+from ebarf_ns.nerf.old_flags import warn_of_old_flags
 
 if TYPE_CHECKING:
     from nerfstudio.configs.base_config import MachineConfig
@@ -51,6 +53,7 @@ _LEAST = {
     "pipeline.model.camera_optimizer.every": 1,
     "pipeline.model.camera_optimizer.align_steps": 0,
     "averaged_steps": 1,
+    "threads": 1,
 }
 _FREE = re.compile(
     r"(max_|steps_per_|evaluations|overwrite|allow_|vis|viewer|logging|load_|project_name|start_paused|save_only|"
@@ -60,6 +63,8 @@ _FREE = re.compile(
 
 def check_settings(config: TrainerConfig) -> None:
     """Raise :class:`TrainingError` that names the flag, its value and what was expected."""
+    warn_of_old_flags(sys.argv)
+    _check_scene_is_named(config)
     for flag in _ABOVE_0:
         value = getattr(config, flag)
         if value is not None and not value > 0:
@@ -75,6 +80,12 @@ def check_settings(config: TrainerConfig) -> None:
             f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
             "Eq. 6 has no unit for what silence allows"
         )
+
+
+def _check_scene_is_named(config: TrainerConfig) -> None:
+    datamanager: Any = config.pipeline.datamanager
+    if datamanager.data is None and datamanager.dataparser.data == type(datamanager.dataparser).data:
+        raise TrainingError("no --data given, expected ns-train ebarf --data SCENE")
 
 
 def check_machine(machine: MachineConfig) -> None:

@@ -1,78 +1,44 @@
 """Training within a budget of steps or seconds, with every evaluation on record and nothing half written."""
 
 import math
-from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 import torch
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import TrainingError, one_line_errors
 from ebarf_ns.evaluation.report import write_report
-from ebarf_ns.geometry.trajectory_file import write_tum
+from ebarf_ns.evaluation.trajectory_error import trajectory_results
+from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.averaging import Averaging
-from ebarf_ns.nerf.checkpoints import chosen_checkpoint, newest_whole, not_finite, read_checkpoint, write_checkpoint
+from ebarf_ns.nerf.checkpoints import chosen_checkpoint, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.guard import GuardedOptimizers
+from ebarf_ns.nerf.machine import use_threads
 from ebarf_ns.nerf.metrics_file import begin_metrics, flags_of, read_header
+from ebarf_ns.nerf.moments import write_moments
 from ebarf_ns.nerf.optimizers import BudgetDecay
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.replay import write_replay
 from ebarf_ns.nerf.run_evaluation import record_evaluation, write_refined
 from ebarf_ns.nerf.run_folder import take_folder
 from ebarf_ns.nerf.run_start import check_scene_is_the_same, keep_run, plan_run, read_scene_of, run_header
-from ebarf_ns.nerf.settings_check import changed_flags, check_machine, check_settings
+from ebarf_ns.nerf.settings_check import changed_flags, check_settings
 from ebarf_ns.nerf.signals import end, signals_to
 from ebarf_ns.nerf.support import Support, support
+from ebarf_ns.nerf.terminal import LiveLine, evaluation_line, plan_line, scene_line, summary
+from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
+from ebarf_ns.nerf.warm_up import compile_kernels
 
 _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
-
-
-@dataclass
-class EbarfTrainerConfig(TrainerConfig):
-    """A nerfstudio training run with a budget."""
-
-    _target: type = field(default_factory=lambda: EbarfTrainer)
-    max_train_seconds: float | None = None
-    """End after this many seconds of training, evaluation and loading excluded, if not after --max-num-iterations
-    steps before; all schedules follow."""
-    evaluations: int = 8
-    """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
-    overwrite: bool = False
-    """Begin anew in a folder that holds a run."""
-    allow_changed_scene: bool = False
-    """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
-    learn_intrinsics: bool = False
-    """Learn focal length, principal point and the camera's distortion coefficients too; the result is written to
-    camera_refined.json, as scene.json has it."""
-    averaged_steps: int = 100
-    """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
-
-    def save_config(self) -> None:
-        """Look whether this machine has what is asked of it, which ns-train begins with.
-
-        The trainer writes config.yml, when it has the folder for itself and a plan.
-        """
-        with one_line_errors():
-            check_machine(self.machine)
-
-    def get_checkpoint_dir(self) -> Path:
-        """Where checkpoints lie; scripts that open a run, and take the newest, are led past those that are damaged."""
-        folder = super().get_checkpoint_dir()
-        opened = self.pipeline.datamanager.dataparser.kept is not None  # pyright: ignore[reportAttributeAccessIssue]
-        if opened and self.load_dir is None and self.load_step is None and any(folder.glob("step-*.ckpt")):
-            with one_line_errors():
-                path, damaged = newest_whole(folder)
-            for error in damaged:
-                CONSOLE.print(f"{error}; {path.name} is taken")
-            self.load_step = int(path.stem.removeprefix("step-")) if damaged else None
-        return folder
 
 
 class EbarfTrainer(Trainer):
@@ -84,6 +50,9 @@ class EbarfTrainer(Trainer):
 
     def setup(self, test_mode: Any = "val") -> None:
         """Build pipeline and optimizers; what a user can cause ends in one line."""
+        self.begun_s = monotonic()
+        self.live = LiveLine()
+        self.results: dict[str, Any] = {}
         self.train_seconds = 0.0
         self.event_pairs = 0
         self.steps_done = 0
@@ -99,6 +68,8 @@ class EbarfTrainer(Trainer):
             try:
                 self._plan()
                 super().setup(test_mode)
+                self._say_plan()
+                self.compile_seconds = compile_kernels(self.pipeline)
                 self._align()
                 if self.progress() >= 1:
                     raise TrainingError(
@@ -125,8 +96,16 @@ class EbarfTrainer(Trainer):
         if self._loaded_path and not self.config.allow_changed_scene:
             check_scene_is_the_same(scene, header, self._loaded_path)
         self.plan = plan_run(self.config, scene, self.device, header)
+        use_threads(self.config.threads)
         if self.local_rank == 0:
             keep_run(self.config, scene, self.base_dir)
+
+    @check_main_thread
+    def _say_plan(self) -> None:
+        scene, given = self.pipeline.scene, self.pipeline.trajectory(refined=False)
+        self.errors_given = trajectory_results(given, read_tum(scene.groundtruth)) if scene.groundtruth else {}
+        CONSOLE.print(scene_line(scene, len(self.pipeline.datamanager.index.events), len(given.t_us)))
+        CONSOLE.print(plan_line(self.plan))
 
     @cached_property
     def _header_of_resumed_run(self) -> dict[str, Any]:
@@ -172,7 +151,8 @@ class EbarfTrainer(Trainer):
         try:
             with one_line_errors(), signals_to(self._stop):
                 self._begin_metrics()
-                super().train()
+                with self.live:
+                    super().train()
         finally:
             self._release_folder()
         if self.signal:
@@ -192,12 +172,24 @@ class EbarfTrainer(Trainer):
             self.save_checkpoint(self.step)
             self._write_report()
             return
+        self.live.stop()
+        self.training_state = "completed"
+        self.save_checkpoint(self.step)
         self._write_report()
-        super()._after_train()
+        writer.write_out_storage()
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step=self.step, location=TrainingCallbackLocation.AFTER_TRAIN)
+        if not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()
 
     @check_main_thread
     def _write_report(self) -> None:
         write_report(self.base_dir, self.pipeline.scene.groundtruth)
+        wall_seconds = monotonic() - self.begun_s
+        CONSOLE.print(summary(self.base_dir, self.train_seconds, wall_seconds, self.results, self.errors_given))
+
+    def _check_viewer_warnings(self) -> None:
+        """Nerfstudio's says that nothing is evaluated, which is not so here."""
 
     def _train_complete_viewer(self) -> None:
         with self.averaging.shown():
@@ -229,6 +221,7 @@ class EbarfTrainer(Trainer):
             self._evaluate(self.last_loss)
         if after >= 1 or self.signal:
             self.stop_training = True
+        self.live.update(after, self.steps_done, self.train_seconds, monotonic() - started, self.last_loss)
         return result
 
     @check_main_thread
@@ -258,9 +251,11 @@ class EbarfTrainer(Trainer):
         self.evaluated_step = self.steps_done
         with self.averaging.shown():
             results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
-            write_refined(self.pipeline, results, self.base_dir)
-            support_found = self._support() if final else None
-        record = {
+            write_refined(self.pipeline, self.base_dir)
+            if final:
+                write_moments(self.pipeline, self.base_dir / "moments.npz")
+            found = self._support() if final else None
+        self.results = {
             "step": self.steps_done,
             "train_seconds": round(self.train_seconds, 3),
             "event_pairs": self.event_pairs,
@@ -269,11 +264,10 @@ class EbarfTrainer(Trainer):
             "skipped_steps": self.optimizers.skipped,
             "peak_memory_mib": round(peak_memory_mib(self.device), 1),
         }
-        if support_found:
-            record["support"] = {"verdict": support_found.verdict, "says": str(support_found), **asdict(support_found)}
-        record_evaluation(record, results, self.base_dir)
-        if support_found:
-            CONSOLE.print(str(support_found))
+        record_evaluation(self.results, found, self.base_dir)
+        CONSOLE.print(evaluation_line(self.train_seconds, self.steps_done, self.results, self.errors_given))
+        if found:
+            CONSOLE.print(str(found))
 
     def _support(self) -> Support | None:
         """What held-out events say of the refined trajectory, where there is the budget to ask them."""
@@ -286,7 +280,10 @@ class EbarfTrainer(Trainer):
     @check_main_thread
     def _begin_metrics(self) -> None:
         write_tum(self.base_dir / "trajectory_initial.txt", self.pipeline.trajectory(refined=False))
-        header = lambda: run_header(self.config, self.pipeline, self.device, self.plan, self.alignment)  # noqa: E731
+        header = lambda: {  # noqa: E731
+            **run_header(self.config, self.pipeline, self.device, self.plan, self.alignment),
+            "compile_seconds": round(self.compile_seconds, 1),
+        }
         begin_metrics(self.base_dir, header, self._start_step)
 
     @check_main_thread

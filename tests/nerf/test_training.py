@@ -295,7 +295,7 @@ def test_the_fast_paths_train_as_the_torch_reference_does(
     for name in ("kernels", "reference"):
         ready = trainer(config(tiny_scene, tmp_path / name, steps=60))
         if name == "reference":
-            ready.pipeline.model.renderer.field.grid.carrier = "torch"
+            ready.pipeline.model.renderer.field.grid.backend = "torch"
             monkeypatch.setattr(ray_sampling_numba, "importance_edges", ray_sampling.importance_edges)
         ready.train()
         ends.append(ready.pipeline.evaluate())
