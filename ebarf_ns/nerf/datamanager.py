@@ -87,7 +87,8 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """The keyframes' views."""
         dataset = super().create_train_dataset()
         # All are of one size. Of 100,000, nerfstudio would look at each, for minutes; it does so where this is set.
-        self._kept_outputs, self.train_dataparser_outputs = self.train_dataparser_outputs, None
+        self._kept_outputs = self.train_dataparser_outputs
+        self.train_dataparser_outputs = None  # pyright: ignore[reportAttributeAccessIssue]
         return dataset
 
     def setup_train(self) -> None:
