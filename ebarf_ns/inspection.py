@@ -10,6 +10,7 @@ from rich.table import Table
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
+from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
 from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import Estimate, SensorFacts, identify_recording
@@ -73,6 +74,8 @@ def inspect_scene(folder: Path) -> Summary:
         check_clocks(scene, (summary.start_us, summary.end_us), trajectory)
     except SceneError as error:
         summary.suspicions.append(str(error))
+    contradicted = polarity_contradicted(polarity_correlations(scene))
+    summary.suspicions.extend([contradicted] if contradicted else [])
     summary.suspicions.extend(_suspicions(scene, summary, trajectory))
     return summary
 

@@ -242,7 +242,8 @@ class Bench:
             sys.stdout.write(shown + "\n")
 
     def _engine(self) -> tuple[dict[str, Any], str]:
-        from ebarf_ns.benchmarks.engine import run_engine_benchmark, table, write
+        from ebarf_ns.benchmarks.engine import run_engine_benchmark
+        from ebarf_ns.benchmarks.figures import table, write
 
         result = run_engine_benchmark(self.engine, _stderr.print)
         if self.output:
@@ -250,7 +251,7 @@ class Bench:
         return result, table(result)
 
     def _recordings(self) -> tuple[dict[str, Any], str]:
-        from ebarf_ns.benchmarks.engine import table, write
+        from ebarf_ns.benchmarks.figures import table, write
         from ebarf_ns.benchmarks.recordings import run_recordings_benchmark
 
         result = run_recordings_benchmark(self.recordings, _stderr.print)
@@ -261,7 +262,8 @@ class Bench:
     def _comparison(self) -> tuple[dict[str, Any], str]:
         from ebarf_ns.benchmarks.comparison import run_comparison
         from ebarf_ns.benchmarks.manifest import read_manifest
-        from ebarf_ns.evaluation.diagrams import tables, write_diagrams
+        from ebarf_ns.evaluation.comparison_tables import tables
+        from ebarf_ns.evaluation.diagrams import write_diagrams
 
         manifest = read_manifest(Path(self.what))
         folder = self.output or Path("bench") / manifest.name

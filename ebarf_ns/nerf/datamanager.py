@@ -17,17 +17,10 @@ from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import EbarfError, RecordingError, one_line_errors
-from ebarf_ns.events.pairs import (
-    DrawAhead,
-    EventPairs,
-    HeldoutBlocks,
-    PairIndex,
-    accumulate,
-    batch_random,
-    index_pairs,
-    joined,
-)
-from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import EventPairs, PairIndex, joined
+from ebarf_ns.events.recording import RecordingFile, accumulate
 from ebarf_ns.events.sensor_facts import SensorFacts, identify
 from ebarf_ns.events.timing import clock_step_us, flicker_hz
 from ebarf_ns.geometry.trajectory import Trajectory

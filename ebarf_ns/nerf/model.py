@@ -21,7 +21,7 @@ from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
 from ebarf_ns.photometry.sensor_response import SensorResponse, thresholds_of_ratio
 from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
-from ebarf_ns.radiance.hash_grid import HashGridShape
+from ebarf_ns.radiance.lattice import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
 from ebarf_ns.scene import Scene

@@ -11,8 +11,7 @@ from ebarf_ns.errors import TrainingError
 
 if TYPE_CHECKING:
     from nerfstudio.configs.base_config import MachineConfig
-
-    from ebarf_ns.nerf.trainer import EbarfTrainerConfig
+    from nerfstudio.engine.trainer import TrainerConfig
 
 _ABOVE_0 = ("max_num_iterations", "max_train_seconds")
 _LEAST = {
@@ -54,7 +53,7 @@ _LEAST = {
 }
 
 
-def check_settings(config: EbarfTrainerConfig) -> None:
+def check_settings(config: TrainerConfig) -> None:
     """Raise :class:`TrainingError` that names the flag, its value and what was expected."""
     for flag in _ABOVE_0:
         value = getattr(config, flag)

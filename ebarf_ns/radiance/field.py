@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import interpolate
 
-from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape
+from ebarf_ns.radiance.hash_grid import HashGrid
+from ebarf_ns.radiance.lattice import HashGridShape
 
 if TYPE_CHECKING:
     from jaxtyping import Float

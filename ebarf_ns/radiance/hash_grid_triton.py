@@ -20,7 +20,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from ebarf_ns.radiance.hash_grid import Lattice
+    from ebarf_ns.radiance.lattice import Lattice
 
 _BLOCK = 128  # points a program
 

@@ -4,17 +4,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.pairs import (
-    DrawAhead,
-    EventPairs,
-    HeldoutBlocks,
-    PairIndex,
-    accumulate,
-    batch_random,
-    draw_steps,
-    index_pairs,
-)
-from ebarf_ns.events.recording import Recording
+from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import EventPairs, PairIndex, draw_steps
+from ebarf_ns.events.recording import Recording, accumulate
 
 WIDTH, HEIGHT = 4, 3
 

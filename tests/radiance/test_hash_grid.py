@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import nn
 
-from ebarf_ns.radiance.hash_grid import Carrier, HashGrid, HashGridShape, encode_reference, fastest_carrier
+from ebarf_ns.radiance.hash_grid import Carrier, HashGrid, encode_reference, fastest_carrier
+from ebarf_ns.radiance.lattice import HashGridShape
 
 SHAPES = [
     HashGridShape(levels=4, features=2, coarsest=4, finest=64, table_size_log2=10),
