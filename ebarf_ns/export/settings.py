@@ -39,6 +39,6 @@ class SurfaceSettings:
     """Size of a cell; where not given, a 160th of what is seen."""
     farthest: float | None = None
     """Leave out what is further from the camera than this."""
-    blur: float = 0.05
+    blur: float = 0.08
     """Leave out where half of a ray's light comes from over more than this share of its distance: higher leaves fewer
     holes and surfaces that are less exact."""

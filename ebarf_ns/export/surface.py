@@ -10,7 +10,7 @@ import torch
 
 from ebarf_ns.errors import ExportError
 from ebarf_ns.export.fusion import Volume
-from ebarf_ns.export.views import View, evenly, look, tone_of
+from ebarf_ns.export.views import Tone, View, bearings, evenly, look, tone_of
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.cameras import Camera
 
@@ -98,11 +98,12 @@ def _views(subject: Subject, settings: SurfaceSettings, progress: Callable[[floa
         if value is not None and not value > 0:
             raise ExportError(f"{name} is {value}, expected a length above 0")
     camera = without_distortion(subject.camera)
+    within = _within(subject.camera, bearings(camera))
     t_us = evenly(subject.trajectory.t_us.numpy(), _MOST_VIEWS).tolist()
     views = []
     for k, one in enumerate(t_us):
         view = look(subject, camera, one)
-        sharp = (view.spread < settings.blur * view.distance) & _within(subject.camera, view.bearing)
+        sharp = within & (view.spread < settings.blur * view.distance)
         if settings.farthest:
             sharp &= view.distance <= settings.farthest
         views.append(replace(view, distance=np.where(sharp, view.distance, 0)))
@@ -114,7 +115,7 @@ def _views(subject: Subject, settings: SurfaceSettings, progress: Callable[[floa
 
 def without_distortion(camera: Camera) -> Camera:
     """A pinhole camera that sees what another does up to 60 degrees off its axis, in no more pixels than are needed."""
-    bearing = camera.bearings(camera.pixel_grid()).numpy()
+    bearing = bearings(camera)
     ahead = bearing[bearing[..., 2] > 1 / np.hypot(1, _WIDEST_TAN)]
     (left, top), (right, bottom) = (edge((ahead[:, :2] / ahead[:, 2:]), axis=0) for edge in (np.min, np.max))
     pixels = ((right - left) * camera.fx + 1) * ((bottom - top) * camera.fy + 1)
@@ -154,7 +155,7 @@ def _box(
     return lower, upper, voxel
 
 
-def _tone(subject: Subject):
+def _tone(subject: Subject) -> Tone:
     first_us, last_us = subject.trajectory.t_us[[0, -1]].tolist()
     return tone_of(subject, first_us, last_us)
 

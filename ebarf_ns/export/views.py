@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -45,13 +46,19 @@ class View:
 def look(subject: Subject, camera: Camera, t_us: int) -> View:
     """What a camera sees from the refined pose of a moment."""
     pose = subject.poses_at(torch.tensor([t_us])).matrix()[0].double().numpy()
-    bearing = camera.bearings(camera.pixel_grid()).numpy()
+    bearing = bearings(camera)
     direction = bearing.reshape(-1, 3) @ pose[:, :3].T
     seen = subject.see(np.broadcast_to(pose[:, 3], direction.shape), direction)
     distance = np.where(seen.accumulation > _LEAST_LIGHT, seen.distance, 0)
     columns = (seen.brightness, distance, seen.spread)
     images = (column.reshape(camera.height, camera.width).astype(np.float32) for column in columns)
     return View(camera, pose, bearing, *images)
+
+
+@lru_cache(maxsize=4)
+def bearings(camera: Camera) -> Float[np.ndarray, "height width 3"]:
+    """Unit directions of all pixels, in the camera's frame."""
+    return camera.bearings(camera.pixel_grid()).numpy()
 
 
 def scaled(camera: Camera, height: int) -> Camera:

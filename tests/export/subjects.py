@@ -1,9 +1,12 @@
 """A subject whose scene is known: the simulated room itself, where a trained field would be."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 
 from ebarf_ns.export.subject import Seen
 from ebarf_ns.geometry.cameras import Camera
@@ -66,3 +69,8 @@ def true_points(subject: KnownRoom, every: int = 7) -> np.ndarray:
         origin = np.broadcast_to(matrix[:, 3], direction.shape)
         points.append(origin + subject.see(origin, direction).distance[:, None] * direction)
     return np.concatenate(points)
+
+
+def read_ply(path: Path) -> Any:
+    """A mesh or a cloud, as the file has it."""
+    return trimesh.load(path, process=False)

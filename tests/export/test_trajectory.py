@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,14 +87,14 @@ def test_colmap_text_is_what_its_manual_says(scene: Scene, camera: Camera, tmp_p
 
 @CAMERAS
 def test_pycolmap_reads_it(scene: Scene, camera: Camera, tmp_path: Path):
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed: its reader is not asked")
+    pycolmap: Any = pytest.importorskip("pycolmap", reason="pycolmap is not installed: its reader is not asked")
     subject = KnownRoom(scene, camera)
     export_trajectory(subject, "colmap", tmp_path / "out")
     read = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
     assert read.num_images() == 21 and read.num_points3D() > 1000
     for number, matrix in enumerate(matrices(subject), start=1):
         image = read.images[number]
-        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        pose: Any = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
         assert np.allclose(image.projection_center(), matrix[:, 3], atol=1e-7)
         assert np.allclose(pose.rotation.matrix().T, matrix[:, :3], atol=1e-7)
     # Its camera model and ours put a direction into the same pixel, but for what they call its centre.
