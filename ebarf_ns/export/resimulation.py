@@ -89,5 +89,5 @@ def agreement(predicted: Recording, real: Recording, width: int, height: int) ->
             for one in (predicted, real)
         ]
         varied = all(count.std() > 0 for count in counts)
-        numbers[f"{name}_correlation"] = float(np.corrcoef(*counts)[0, 1]) if varied else 0.0
+        numbers[f"{name}_correlation"] = float(np.corrcoef(counts)[0, 1]) if varied else 0.0
     return numbers

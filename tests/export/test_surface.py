@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ebarf_ns.errors import ExportError
 from ebarf_ns.export.settings import SurfaceSettings
@@ -27,7 +27,7 @@ def test_a_mesh_lies_on_what_was_seen_and_covers_it(scene: Scene, camera: Camera
     assert np.median(distance_to_room(mesh.vertices)) < 0.006
     # No wall along the cones of sight, nor behind the cameras: nothing lies in the room's empty middle.
     assert np.percentile(distance_to_room(mesh.vertices), 99) < 0.1 and distance_to_room(mesh.vertices).max() < 0.2
-    covered, _ = cKDTree(mesh.vertices).query(true_points(subject))
+    covered, _ = KDTree(mesh.vertices).query(true_points(subject))
     assert np.mean(covered < 0.08) > 0.9
 
 
