@@ -27,6 +27,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
         synced(path.parent)
+    except OSError as error:
+        # A full disk does not say of itself what found it full.
+        error.filename = error.filename or str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -51,8 +55,13 @@ def whole_folder(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
         if path.exists():
-            shutil.rmtree(path)
-        temporary.replace(path)
+            # Put away before it is removed, which takes its time.
+            before = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+            path.replace(before)
+            temporary.replace(path)
+            shutil.rmtree(before, ignore_errors=True)
+        else:
+            temporary.replace(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -62,8 +71,13 @@ def refuse_existing(folder: Path) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise EbarfError(f"{folder}: exists, expected a new folder; remove it first where it is not needed")
     # The finished folder takes the place of an empty one, which these cannot give up.
-    if folder.exists() and (folder.is_mount() or folder.samefile(Path.cwd())):
+    if folder.exists() and (os.path.ismount(folder) or folder.samefile(Path.cwd())):
         raise EbarfError(f"{folder}: the current folder or a mounted one, expected a new folder, which may be in it")
+
+
+def is_special(path: Path) -> bool:
+    """Whether a path names a pipe, a socket or a device: to read one may take for ever."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @contextmanager
@@ -76,6 +90,24 @@ def opened_npz(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:
         raise ValueError(f"not a whole npz file of plain arrays ({error})") from None
+
+
+def read_picture(path: Path, flags: int = -1) -> np.ndarray | None:
+    """The pixels of an image file by OpenCV's flags, None where it is no image.
+
+    OpenCV opens no file by itself: on Windows it knows only the names of one code page.
+    """
+    import cv2
+
+    content = np.fromfile(path, np.uint8)
+    return cv2.imdecode(content, flags) if len(content) else None
+
+
+def write_picture(path: Path, pixels: np.ndarray) -> None:
+    """An image file of the kind that its name says."""
+    import cv2
+
+    cv2.imencode(path.suffix, pixels)[1].tofile(path)
 
 
 def _umask() -> int:

@@ -1,12 +1,11 @@
 """What is in a scene folder, and what looks wrong in it."""
 
 from dataclasses import dataclass, field
+from math import atan2, degrees
 from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
@@ -14,14 +13,19 @@ from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correla
 from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import Estimate, SensorFacts, identify_recording
+from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.plan import Line, plan_for
+from ebarf_ns.printing import print_facts, print_line
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
 _FEW_EVENTS_PER_PIXEL = 5
+_FEW_PIXELS = 0.005
+# Lenses that see more, or less, are rarer than focal lengths in another unit.
+_WIDEST_DEG, _WIDEST_FISHEYE_DEG, _NARROWEST_DEG = 150, 240, 2
 
 
 @dataclass(frozen=True)
@@ -67,17 +71,21 @@ def inspect_scene(folder: Path) -> Summary:
     check_bounds(scene, trajectory)
     if scene.groundtruth:
         read_tum(scene.groundtruth)
+    if scene.missing:
+        raise SceneError(f"{scene.missing[0]}: no such file, expected a validation frame{_and_others(scene)}")
     for frame in scene.frames:
         read_frame(frame)
     summary = _summarize(scene, trajectory)
-    try:
-        check_clocks(scene, (summary.start_us, summary.end_us), trajectory)
-    except SceneError as error:
-        summary.suspicions.append(str(error))
+    check_clocks(scene, (summary.start_us, summary.end_us), trajectory)
     contradicted = polarity_contradicted(polarity_correlations(scene))
     summary.suspicions.extend([contradicted] if contradicted else [])
     summary.suspicions.extend(_suspicions(scene, summary, trajectory))
     return summary
+
+
+def _and_others(scene: Scene) -> str:
+    others = len(scene.missing) - 1
+    return f", and {others} more that are named in {scene.folder / 'frames.json'}" if others else ""
 
 
 def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
@@ -148,6 +156,16 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
         found.append(
             f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"
         )
+    active = round((1 - summary.silent_pixel_share) * summary.width * summary.height)
+    if active <= _FEW_PIXELS * summary.width * summary.height:
+        found.append(f"all events are at {active:,} of {summary.width * summary.height:,} pixels: columns mixed up?")
+    found.extend(_view(scene.camera))
+    if scene.bounds is not None:
+        lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
+        position = trajectory.poses.position
+        away = float(((position < lower) | (position > upper)).any(dim=-1).double().mean())
+        if away > 0:
+            found.append(f"{away:.0%} of the keyframes lie outside the bounds: they must hold all that is seen")
     if summary.path_length == 0:
         found.append("the trajectory does not move: depth cannot be seen without translation")
     gaps_us = trajectory.t_us.diff()
@@ -160,9 +178,24 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     found.extend(torn(trajectory))
     if scene.bounds is None:
         found.append(
-            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail"
+            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail; where "
+            "you know how far away the farthest thing is, ebarf process has --farthest"
         )
     return found
+
+
+def _view(camera: Camera) -> list[str]:
+    """How wide the camera sees, where that is hardly what is meant."""
+    sides = ((camera.width, camera.fx), (camera.height, camera.fy))
+    fisheye = camera.model == "equidistant"
+    angles = [degrees(side / focal) if fisheye else degrees(2 * atan2(side / 2, focal)) for side, focal in sides]
+    widest = _WIDEST_FISHEYE_DEG if fisheye else _WIDEST_DEG
+    if _NARROWEST_DEG <= min(angles) and max(angles) <= widest:
+        return []
+    return [
+        f"the camera sees {angles[0]:.3g} by {angles[1]:.3g} degrees, by focal lengths of {camera.fx:.4g} and "
+        f"{camera.fy:.4g} px: in another unit, or of another size of sensor?"
+    ]
 
 
 def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
@@ -184,23 +217,11 @@ def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
 
 
 def print_summary(summary: Summary, folder: Path) -> None:
-    """For a person."""
-    console = Console()
-    table = Table(title=str(folder), show_header=False, title_justify="left")
-    for name, value in _lines(summary):
-        table.add_row(name, value)
-    console.print(table)
-    plan = Table(title="plan of training", title_justify="left")
-    plan.add_column("flag", no_wrap=True)
-    plan.add_column("value", no_wrap=True)
-    plan.add_column("because")
+    """For a person: first what looks wrong."""
+    console = print_facts(folder, summary.suspicions, _lines(summary))
+    console.print("\nplan of training, which these flags of ns-train overrule:")
     for line in summary.plan:
-        plan.add_row(line.flag, str(line.value), line.reason)
-    console.print(plan)
-    for suspicion in summary.suspicions:
-        console.print(f"[yellow]![/yellow] {suspicion}")
-    if not summary.suspicions:
-        console.print("[green]nothing suspicious[/green]")
+        print_line(console, f"{line.flag} = {line.value}: {line.reason}")
 
 
 def _range(estimate: Estimate) -> str:
@@ -239,7 +260,7 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
         ("events within it", f"{summary.events_within_trajectory:,} ({within:.1%})"),
         (
             "thresholds",
-            f"stated: on {threshold[0]}, off {threshold[1]}; "
+            f"stated: on {threshold[0]}, off {threshold[1]}"
             if threshold
             else "not stated; " + f"by events that must cancel, on / off is {_range(summary.sensor.threshold_ratio)}",
         ),

@@ -1,6 +1,7 @@
 """The rooms stay apart: who may import whom."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,11 @@ def test_only_the_nerf_room_imports_nerfstudio():
 def test_evaluation_never_sees_a_live_model():
     for file in files("evaluation"):
         assert not any(name.startswith(("ebarf_ns.nerf", "ebarf_ns.radiance")) for name in imported(file)), file
+
+
+def test_the_map_for_contributors_has_every_room():
+    listed = set(re.findall(r"^\| `(\w+)` \|", (PACKAGE.parent / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.M))
+    assert {path.parent.name for path in PACKAGE.glob("*/__init__.py")} <= listed
 
 
 def test_data_parser_module_is_light():

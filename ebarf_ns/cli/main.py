@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,9 +14,11 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.cli.export_commands import Mesh, Points, Render, TrajectoryExport
-from ebarf_ns.errors import EbarfError, RecordingError, SceneError, one_line_errors
+from ebarf_ns.cli.replay import Replay
+from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
 from ebarf_ns.files import refuse_existing
 from ebarf_ns.formats.process import Format, ProcessSettings
+from ebarf_ns.formats.source import TimeUnit
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
@@ -90,6 +93,10 @@ class Inspect:
     """Of a recording: a PNG to make, with the events of some moments."""
     part: str | None = None
     """Of a recording: the group of an HDF5 file or the topic of a bag that has the events, where several have."""
+    event_time_unit: TimeUnit | None = None
+    """Of a recording: the unit of its times, where it does not say so."""
+    event_columns: str | None = None
+    """Of a recording: the order of columns without names, such as 'x y p t'."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -97,6 +104,10 @@ class Inspect:
         """Print the summary."""
         from ebarf_ns.formats.recognise import recognised_folder
 
+        if not self.scene.exists():
+            raise SceneError(
+                f"{self.scene}: no such file or folder, expected a scene or a recording{did_you_mean(self.scene)}"
+            )
         # A folder that is neither is taken for a scene, and told what it lacks.
         if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
             summary = self._recording()
@@ -111,7 +122,9 @@ class Inspect:
 
         if self.picture and self.picture.suffix.lower() != ".png":
             raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
-        opened = lambda: open_recording(self.scene, part=self.part)  # noqa: E731
+        opened = partial(
+            open_recording, self.scene, part=self.part, time_unit=self.event_time_unit, columns=self.event_columns
+        )
         summary = inspect_recording(opened)
         if self.picture:
             contact_sheet(opened, summary, self.picture)
@@ -326,6 +339,7 @@ def entrypoint() -> None:
                 "mesh": Mesh,
                 "points": Points,
                 "bench": Bench,
+                "replay": Replay,
             },
             description=__doc__,
             args=_with_config(sys.argv[1:]),

@@ -1,18 +1,16 @@
-"""What is in a recording as its camera or its authors left it, before there is a scene."""
+"""Inspection of a raw recording, before it becomes a scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import whole_file, write_picture
 from ebarf_ns.formats.intake import far_busier
 from ebarf_ns.formats.source import Piece, Source
+from ebarf_ns.printing import print_facts
 
 _LARGEST_SENSOR = 8192
 _SLOT_US = 100_000
@@ -24,29 +22,29 @@ _BARS = " ▁▂▃▄▅▆▇█"
 
 @dataclass(frozen=True)
 class RawSummary:
-    """Numbers of a recording; ``suspicions`` are sentences for a person."""
+    """Statistics of a recording; ``suspicions`` are sentences for the user."""
 
     format: str
     events: int
     width: int
     height: int
     sensor_size_said: bool
-    """Whether the file says so; else it is the smallest sensor that holds all events."""
+    """Whether the file gives the size; else it is the smallest that contains all events."""
     start_us: int
     end_us: int
     events_per_second: float
     busiest_events_per_second: float
-    """In the busiest tenth of a second."""
+    """Rate in the busiest tenth of a second."""
     brighter_share: float
     hottest_pixels: list[tuple[int, int, int]]
-    """Column, row and events of some, the busiest first."""
+    """Column, row and event count, the busiest first."""
     rate: list[int]
-    """Events in each of some equal parts of the recording's time."""
+    """Events in equal parts of the recording's time."""
     suspicions: list[str] = field(default_factory=list)
 
 
 def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> RawSummary:
-    """Read a recording once; raises :class:`RecordingError` where its reader cannot go on."""
+    """Read a recording once and summarise it; raises :class:`RecordingError` if it cannot be read."""
     source = open_events()
     counts = np.zeros((1, 1), np.int64)
     slots: dict[int, int] = {}
@@ -91,7 +89,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
 
 
 def _count(path: Path, counts: np.ndarray, piece: Piece) -> np.ndarray:
-    """The events of each pixel, in an array as large as there are coordinates."""
+    """Add a piece to the event counts per pixel, growing the array to fit all coordinates."""
     x, y = piece.x.astype(np.int64), piece.y.astype(np.int64)
     width, height = max(int(x.max()) + 1, counts.shape[1]), max(int(y.max()) + 1, counts.shape[0])
     if min(int(x.min()), int(y.min())) < 0 or max(width, height) > _LARGEST_SENSOR:
@@ -128,7 +126,7 @@ def _suspicions(source: Source, counts: np.ndarray, brighter: float, late: int) 
 
 
 def _doubts(source: Source, events: int, moments: int, span_us: int) -> list[str]:
-    """Of times whose unit was guessed: milliseconds and numbers of frames are few and close together."""
+    """Doubts about a guessed time unit: milliseconds and frame numbers give few distinct, close times."""
     if not source.guessed_unit or span_us >= _SHORTEST_US or events < _FEW_A_MOMENT * moments:
         return []
     return [
@@ -138,7 +136,7 @@ def _doubts(source: Source, events: int, moments: int, span_us: int) -> list[str
 
 
 def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output: Path) -> None:
-    """Pictures of the events of 20 ms each, evenly over the recording, as one PNG."""
+    """Write one PNG with evenly spaced event images of 20 ms each."""
     middles = np.linspace(summary.start_us, summary.end_us, 2 * _PICTURES + 1)[1::2]
     starts = (middles - _PICTURE_US / 2).astype(np.int64)
     pictures = np.zeros((_PICTURES, summary.height, summary.width), np.int64)
@@ -153,17 +151,15 @@ def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output
     framed = np.pad(grey, ((0, 0), (2, 2), (2, 2)), constant_values=255)
     rows = [np.hstack(list(framed[k : k + columns])) for k in range(0, _PICTURES, columns)]
     with whole_file(output) as temporary:
-        cv2.imwrite(str(temporary), np.vstack(rows))
+        write_picture(temporary, np.vstack(rows))
 
 
 def print_raw_summary(summary: RawSummary, path: Path) -> None:
-    """For a person."""
-    console = Console()
-    table = Table(title=str(path), show_header=False, title_justify="left")
+    """Print the summary, suspicions first."""
     seconds = (summary.end_us - summary.start_us) * 1e-6
     size = f"{summary.width} x {summary.height}"
     most = max(1, *summary.rate)
-    for name, value in (
+    facts = [
         ("format", summary.format),
         ("sensor", size if summary.sensor_size_said else f"{size} at least, by its events; the file does not say"),
         ("events", f"{summary.events:,} over {seconds:.3f} s, {summary.events_per_second:,.0f} a second"),
@@ -172,10 +168,5 @@ def print_raw_summary(summary: RawSummary, path: Path) -> None:
         ("time", f"{summary.start_us:,} to {summary.end_us:,} us"),
         ("polarity", f"{summary.brighter_share:.1%} brighter, {1 - summary.brighter_share:.1%} darker"),
         ("busiest pixels", ", ".join(f"({x}, {y}) {count:,}" for x, y, count in summary.hottest_pixels)),
-    ):
-        table.add_row(name, value)
-    console.print(table)
-    for suspicion in summary.suspicions:
-        console.print(f"[yellow]![/yellow] {suspicion}")
-    if not summary.suspicions:
-        console.print("[green]nothing suspicious[/green]")
+    ]
+    print_facts(path, summary.suspicions, facts)

@@ -76,6 +76,7 @@ class EbarfDataParser(DataParser):
         super().__init__(config)
         with one_line_errors():
             self.scene = read_scene(_scene_folder(config))
+            _say_what_is_missing(self.scene)
             self.trajectory = read_tum(self.scene.trajectory)
             _check_scene_is_the_runs(self.scene, self.trajectory, config.kept)
             self.normalization = _normalization(self.scene, self.trajectory)
@@ -102,7 +103,9 @@ class EbarfDataParser(DataParser):
 
     def _keyframe_views(self, keyframes: Trajectory, every: int = 1) -> tuple[Cameras, list[Path]]:
         chosen = Trajectory(keyframes.t_us[::every], Poses(*(column[::every] for column in keyframes.poses)))
-        files = [self.scene.folder / "keyframes" / f"{t_us}.png" for t_us in chosen.t_us.tolist()]
+        # Names of 100,000 files, put together one by one by pathlib, would take seconds.
+        folder = str(self.scene.folder / "keyframes")
+        files = [Path(f"{folder}/{t_us}.png") for t_us in chosen.t_us.tolist()]
         return _nerfstudio_cameras([self.scene.camera] * len(files), chosen.t_us, chosen.poses.matrix()), files
 
     def _evaluation_views(self, keyframes: Trajectory) -> tuple[Cameras, list[Path]]:
@@ -148,6 +151,15 @@ def _scene_folder(config: EbarfDataParserConfig) -> Path:
         raise SceneError(moved(config))
     sys.stderr.write(f"opened by the run's own {config.kept}, without frames and recording ({moved(config)})\n")
     return config.kept
+
+
+def _say_what_is_missing(scene: Scene) -> None:
+    """Frames show how good a training is, and it goes on without them."""
+    if scene.missing:
+        sys.stderr.write(
+            f"warning: {scene.missing[0]}: no such file; {len(scene.missing)} of the validation frames' files are "
+            f"missing, and {len(scene.frames)} frames are left to compare renders with\n"
+        )
 
 
 def _check_scene_is_the_runs(scene: Scene, trajectory: Trajectory, kept: Path | None) -> None:
@@ -210,14 +222,31 @@ def frame_cameras(frames: list[Frame], event_camera: Trajectory, mount_scale: fl
     )
 
 
+def replace_intrinsics(cameras: Cameras, given: Camera, learned: Camera) -> None:
+    """Give those of the cameras that are the event camera, by its intrinsics as given, the intrinsics learned."""
+    one = Trajectory(torch.zeros(1, dtype=torch.int64), Poses(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])))
+    before, after = (_nerfstudio_cameras([camera], one.t_us, one.poses.matrix()) for camera in (given, learned))
+    columns = ("fx", "fy", "cx", "cy", "width", "height")
+    same = torch.cat([getattr(cameras, name) == getattr(before, name) for name in columns], dim=-1).all(dim=-1)
+    for name in ("fx", "fy", "cx", "cy", "distortion_params"):
+        column, new = getattr(cameras, name), getattr(after, name)
+        if column is not None and new is not None:
+            setattr(cameras, name, torch.where(same[:, None], new.to(column), column))
+
+
 def _nerfstudio_cameras(
     cameras: list[Camera], t_us: Int64[Tensor, "cameras"], camera_to_world: Float[Tensor, "cameras 3 4"]
 ) -> Cameras:
-    def column(name: str) -> Tensor:
-        return torch.tensor([[getattr(camera, name)] for camera in cameras])
+    # Mostly one and the same, 100,000 times.
+    kinds = {camera: k for k, camera in enumerate(dict.fromkeys(cameras))}
+    which = torch.tensor([kinds[camera] for camera in cameras])
 
+    def column(name: str) -> Tensor:
+        return torch.tensor([[getattr(camera, name)] for camera in kinds])[which]
+
+    fisheye = torch.tensor([[camera.model == "equidistant"] for camera in kinds])[which]
     # At the very centre of a fisheye, nerfstudio divides 0 by 0.
-    aside = torch.tensor([[_ASIDE_PX if camera.model == "equidistant" else 0.0] for camera in cameras])
+    aside = _ASIDE_PX * fisheye
     return Cameras(
         camera_to_worlds=opengl_from_opencv(camera_to_world),
         fx=column("fx"),
@@ -226,12 +255,10 @@ def _nerfstudio_cameras(
         cy=column("cy") + 0.5,
         width=column("width"),
         height=column("height"),
-        distortion_params=torch.tensor([_nerfstudio_distortion(camera) for camera in cameras])
-        if any(camera.distortion for camera in cameras)
+        distortion_params=torch.tensor([_nerfstudio_distortion(camera) for camera in kinds])[which]
+        if any(camera.distortion for camera in kinds)
         else None,
-        camera_type=[
-            CameraType.FISHEYE if camera.model == "equidistant" else CameraType.PERSPECTIVE for camera in cameras
-        ],
+        camera_type=torch.where(fisheye, CameraType.FISHEYE.value, CameraType.PERSPECTIVE.value),
         metadata={"camera_t_us": t_us[:, None]},
     )
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from ebarf_ns.errors import TrainingError
+from ebarf_ns.nerf.old_flags import warn_of_old_flags
 
 if TYPE_CHECKING:
     from nerfstudio.configs.base_config import MachineConfig
@@ -50,11 +53,18 @@ _LEAST = {
     "pipeline.model.camera_optimizer.every": 1,
     "pipeline.model.camera_optimizer.align_steps": 0,
     "averaged_steps": 1,
+    "threads": 1,
 }
+_FREE = re.compile(
+    r"(max_|steps_per_|evaluations|overwrite|allow_|vis|viewer|logging|load_|project_name|start_paused|save_only|"
+    r"log_gradients|machine\.(num|machine|dist)|pipeline\.datamanager\.(index_memory|eval_))"
+)
 
 
 def check_settings(config: TrainerConfig) -> None:
     """Raise :class:`TrainingError` that names the flag, its value and what was expected."""
+    warn_of_old_flags(sys.argv)
+    _check_scene_is_named(config)
     for flag in _ABOVE_0:
         value = getattr(config, flag)
         if value is not None and not value > 0:
@@ -72,6 +82,12 @@ def check_settings(config: TrainerConfig) -> None:
         )
 
 
+def _check_scene_is_named(config: TrainerConfig) -> None:
+    datamanager: Any = config.pipeline.datamanager
+    if datamanager.data is None and datamanager.dataparser.data == type(datamanager.dataparser).data:
+        raise TrainingError("no --data given, expected ns-train ebarf --data SCENE")
+
+
 def check_machine(machine: MachineConfig) -> None:
     """Raise :class:`TrainingError` for devices that are not here."""
     found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
@@ -85,3 +101,12 @@ def check_machine(machine: MachineConfig) -> None:
         raise TrainingError(
             f"--machine.num-devices is {machine.num_devices}, expected 1 to {most}, as many as are here"
         )
+
+
+def changed_flags(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """The flags of a run that are others now, with what they were; empty where none is, or where it did not say.
+
+    Those of the budget, and of what is written and shown, may change as a run goes on.
+    """
+    changed = [name for name in now if name in before and before[name] != now[name] and not _FREE.match(name)]
+    return ", ".join(f"--{name.replace('_', '-')} {before[name]} (now {now[name]})" for name in changed)
