@@ -40,5 +40,5 @@ class SurfaceSettings:
     farthest: float | None = None
     """Leave out what is further from the camera than this."""
     blur: float = 0.08
-    """Leave out where half of a ray's light comes from over more than this share of its distance: higher leaves fewer
-    holes and surfaces that are less exact."""
+    """Leave out rays where half of the compositing weight is spread over more than this share of the depth: higher means
+    fewer holes and less exact surfaces."""

@@ -20,9 +20,9 @@ class Seen(NamedTuple):
     distance: Float[np.ndarray, "rays"]
     """Of the surface, along the ray, in the trajectory's unit."""
     spread: Float[np.ndarray, "rays"]
-    """Length around it from which half of the light comes, in the same unit."""
+    """Distance between the quantiles that hold the half of the compositing weight around it, in the same unit."""
     accumulation: Float[np.ndarray, "rays"]
-    """Share of the light that comes from within the scene."""
+    """Opacity: share of the light that comes from the scene, not the background."""
 
 
 class Subject(Protocol):

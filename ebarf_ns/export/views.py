@@ -33,9 +33,9 @@ class View:
     brightness: Float[np.ndarray, "height width"]
     """Log brightness."""
     distance: Float[np.ndarray, "height width"]
-    """Along the rays; 0 where three quarters of the light or more come from beyond the scene."""
+    """Surface depth along the rays; 0 where the accumulation is below 0.25."""
     spread: Float[np.ndarray, "height width"]
-    """Length along the ray from which half of the light comes."""
+    """Distance along the ray that holds half of the compositing weight."""
 
     @property
     def depth(self) -> Float[np.ndarray, "height width"]:
