@@ -8,20 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import OdometryError
-from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
-from ebarf_ns.odometry.agreement import agreement
 from ebarf_ns.odometry.event_images import event_images
-from ebarf_ns.odometry.rotation import turned
-from ebarf_ns.odometry.structure import Map, mapped
-from ebarf_ns.odometry.tracks import Tracks, followed
+from ebarf_ns.odometry.mapping import Map, halved, mapped
+from ebarf_ns.odometry.pace import Pace, paced
+from ebarf_ns.odometry.rotation import Turned, turned
+from ebarf_ns.odometry.tracks import Tracks, displacements_px, followed
+from ebarf_ns.odometry.verdict import INLIER_PX, Agreement, Quality, agreement, explained, view_share
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float64, Int64
@@ -29,55 +29,25 @@ if TYPE_CHECKING:
     from ebarf_ns.events.recording import RecordingFile
     from ebarf_ns.geometry.cameras import Camera
 
-_SHORTEST_US, _FEWEST_KEYFRAMES = 50_000, 12
-_IMAGES_A_KEYFRAME = 4
-_FASTEST_PX, _MOST_HALVINGS = 14.0, 2
-_FEWEST_TRACKS, _TRACK_IMAGES = 20, 3
-_STILL_PX = 2.0
-_INLIER_PX, _LEAST_INLIERS, _LEAST_SHARE = 2.0, 12, 0.5
-_LONGEST_HOLE = 3
-_LEAST_SPAN = 0.4
+_SHORTEST_US, _FEWEST_KEYFRAMES, _IMAGES_A_KEYFRAME = 50_000, 12, 4
+_PILOTS, _PILOT_S, _USUAL_PX_S = 8, 0.01, 150.0
+_MEMORY_S, _KEYFRAME_S = (0.005, 0.3), (0.004, 0.1)
+"""Shortest and longest time constant of event images, and time between keyframes."""
+_SHORTEST_TRACK, _FEWEST_TRACKS = 3, 20
 _LEAST_VIEW = 0.15
-_MOST_DISAGREEMENT = 0.08
-_LEAST_COMMON = 0.6
-_PARALLAX_FACTOR, _PARALLAX_PX = 1.5, 0.5
-_TURNED_PX, _TURNED_SHARE = 1.2, 0.7
+_STILL_PX, _NO_PARALLAX_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.5
+_LEAST_INLIERS = 0.6
+_TRY_PARALLAX = "move the camera sideways by a tenth of the distance of what it sees, or give a trajectory"
 
 
 @dataclass(frozen=True)
 class OdometrySettings:
     """How an initial trajectory is estimated."""
 
-    keyframe_ms: float = 40.0
-    """Time between keyframes; shorter where the recording is short or the motion fast."""
-    time_constant_ms: float = 100.0
-    """Of the event images: how long an event is seen in them."""
-    seed: int = 0
-    """Of the random samples that geometry is tried on."""
-
-
-@dataclass(frozen=True)
-class Quality:
-    """What a user can judge an estimate by."""
-
-    kind: Literal["six degrees of freedom", "rotation only"]
-    span_share: float
-    """Of the recording's time that the trajectory covers."""
-    keyframes: int
-    tracks: int
-    """That the trajectory rests on."""
-    inlier_share: float
-    """Of the observations: those within 2 px of where the map has them."""
-    reprojection_px: float
-    """Root mean square of those."""
-    parallax_px: float
-    """Median by track of what rotation alone leaves unexplained."""
-    disagreement: float | None
-    """Root mean square difference of a trajectory by half of the tracks from their mean, over the path's extent."""
-    view_share: float
-    """Of the picture that the tracks span, median of the keyframes."""
-    missing_s: tuple[tuple[float, float], ...]
-    """Stretches of time within the span without keyframes."""
+    keyframe_px: float = 5.0
+    """How far things move between keyframes, usually."""
+    memory_px: float = 4.5
+    """How far they move in the time constant of the event images."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +55,9 @@ class Estimate:
     """An initial trajectory that the method vouches for."""
 
     trajectory: Trajectory
-    """Its unit is the median distance of the points from the cameras that see them."""
+    """In units of the usual distance of what is seen."""
     points: Float64[np.ndarray, "points 3"]
-    """Empty of a rotation alone."""
+    """None of a rotation alone."""
     position_std: Float64[np.ndarray, "keyframes"]
     rotation_std_rad: Float64[np.ndarray, "keyframes"]
     quality: Quality
@@ -104,15 +74,156 @@ def estimated(
     count, first_us, last_us = file.span()
     if last_us - first_us < _SHORTEST_US:
         raise OdometryError(
-            f"{file.path}: {count:,} events over {(last_us - first_us) / 1000:.1f} ms, expected 50 ms or more; "
-            "too little moves in so short a time: give a longer recording"
+            f"{file.path}: {count:,} events over {(last_us - first_us) / 1000:.1f} ms, too short a time for parallax; "
+            f"expected {_SHORTEST_US // 1000} ms or more"
         )
-    tracks, t_us = _tracks(file, camera, settings, threshold_ratio, progress)
-    _check_features(tracks, file, camera)
+    progress("counting events")
+    pace, hot = paced(file)
+    progress("following features")
+    tracks, t_us = _tracks(file, camera, settings, pace, hot, threshold_ratio)
+    by_keyframe = np.bincount(tracks.image, minlength=len(t_us))
+    if np.median(by_keyframe) < _FEWEST_TRACKS:
+        raise OdometryError(
+            f"{file.path}: too few features, {np.median(by_keyframe):.0f} in most keyframes are followed through "
+            f"{_SHORTEST_TRACK}, expected {_FEWEST_TRACKS} or more; a scene with more texture, or less noise"
+        )
     focal_px = float(np.sqrt(camera.fx * camera.fy))
-    rotation = turned(tracks)
-    aside = _by_track(rotation.residuals(tracks), tracks) * focal_px if rotation else np.array([np.inf])
-    parallax_px = float(np.median(aside[np.isfinite(aside)])) if np.isfinite(aside).any() else float("inf")
+    seen = view_share(tracks, camera.width * camera.height / (camera.fx * camera.fy))
+    if seen < _LEAST_VIEW:
+        raise OdometryError(
+            f"{file.path}: features in {seen:.0%} of the view alone, expected {_LEAST_VIEW:.0%} or more; "
+            "what moves may be an object rather than the camera"
+        )
     progress("mapping")
-    maps = mapped(tracks, focal_px, settings.seed)
-    ...
+    rotation = turned(tracks)
+    if rotation is None:
+        raise OdometryError(
+            f"{file.path}: too few features, two keyframes one after the other share hardly any; a scene with more "
+            "texture, or a slower motion"
+        )
+    return _judged(file, tracks, t_us, rotation, focal_px, seen, progress)
+
+
+def _judged(
+    file: RecordingFile, tracks: Tracks, t_us: Int64[np.ndarray, "keyframes"], rotation: Turned, focal_px: float,
+    seen: float, progress: Callable[[str], None],
+) -> Estimate:  # fmt: skip
+    """The estimate that stands every test, a rotation where that explains the tracks; or the reason for none."""
+    parallax_px = focal_px * float(np.median(rotation.stray_rad))
+    turn_px = focal_px * float(Rotation.from_matrix(rotation.rotation @ rotation.rotation[0].T).magnitude().max())
+    if parallax_px < _LITTLE_PARALLAX_PX and turn_px < _STILL_PX:
+        raise OdometryError(
+            f"{file.path}: no motion, features stay within {max(parallax_px, turn_px):.1f} px; expected a camera that "
+            "moves"
+        )
+    if parallax_px < _NO_PARALLAX_PX:
+        return _of_rotation(tracks, t_us, rotation, focal_px, seen)
+    whole = mapped(tracks, focal_px, rotation)
+    found, why = None, f"no two keyframes begin a map; {_TRY_PARALLAX}"
+    if whole is not None:
+        kept = explained(whole, tracks)
+        inside = kept[tracks.image]
+        inliers = float((whole.residuals_px() < INLIER_PX)[inside].mean()) if inside.any() else 0.0
+        why = (
+            f"one camera's motion explains {inliers:.0%} of the features' in {kept.sum()} of {len(t_us)} keyframes; "
+            "objects that move by themselves, or too little texture?"
+        )
+        if inliers >= _LEAST_INLIERS:
+            progress("checking")
+            halves = [mapped(halved(tracks, which), focal_px, rotation) for which in (0, 1)]
+            why = f"either half of the features tells another motion; {_TRY_PARALLAX}"
+            if halves[0] is not None and halves[1] is not None:
+                found = agreement(whole, halves[0], halves[1], kept)
+    if whole is not None and found is not None:
+        return _of_map(whole, found, t_us, focal_px, parallax_px, seen)
+    if parallax_px < _LITTLE_PARALLAX_PX:
+        return _of_rotation(tracks, t_us, rotation, focal_px, seen)
+    raise OdometryError(f"{file.path}: no trajectory to vouch for: {why}")
+
+
+def _of_map(
+    whole: Map, found: Agreement, t_us: Int64[np.ndarray, "keyframes"], focal_px: float, parallax_px: float, seen: float
+) -> Estimate:
+    bundle, image = whole.bundle, found.image
+    residual = whole.residuals_px()[np.isin(whole.tracks.image, image)]
+    good = np.nonzero((whole.residuals_px() < INLIER_PX) & np.isin(whole.tracks.image, image))[0]
+    number = np.unique(whole.tracks.track[good])
+    points = bundle.positions()[number]
+    usual = float(np.median(np.linalg.norm(points - np.median(bundle.centre[image], axis=0), axis=1)))
+    quat_xyzw = Rotation.from_matrix(bundle.rotation[image].transpose(0, 2, 1)).as_quat()
+    quality = Quality(
+        kind="six degrees of freedom",
+        span_share=float((t_us[image[-1]] - t_us[image[0]]) / (t_us[-1] - t_us[0])),
+        keyframes=len(image),
+        tracks=len(number),
+        inlier_share=float((residual < INLIER_PX).mean()),
+        reprojection_px=float(np.sqrt(np.mean(residual[residual < INLIER_PX] ** 2))),
+        parallax_px=parallax_px,
+        disagreement=found.apart,
+        view_share=seen,
+    )
+    trajectory = _trajectory(t_us[image], bundle.centre[image] / usual, quat_xyzw)
+    return Estimate(trajectory, points / usual, found.position_std / usual, found.rotation_std_rad, quality)
+
+
+def _of_rotation(
+    tracks: Tracks, t_us: Int64[np.ndarray, "keyframes"], rotation: Turned, focal_px: float, seen: float
+) -> Estimate:
+    """A camera that turns where it is; what its tracks leave unexplained may be turns or shifts."""
+    stray_px = focal_px * rotation.stray_rad
+    good = stray_px < INLIER_PX
+    quality = Quality(
+        kind="rotation only",
+        span_share=1.0,
+        keyframes=len(t_us),
+        tracks=int(good.sum()),
+        inlier_share=float(good[np.searchsorted(rotation.track, tracks.track)].mean()),
+        reprojection_px=float(np.sqrt(np.mean(stray_px[good] ** 2))),
+        parallax_px=float(np.median(stray_px)),
+        disagreement=None,
+        view_share=seen,
+    )
+    quat_xyzw = Rotation.from_matrix(rotation.rotation.transpose(0, 2, 1)).as_quat()
+    std_rad = np.full(len(t_us), quality.parallax_px / focal_px)
+    nothing = np.zeros((len(t_us), 3))
+    return Estimate(_trajectory(t_us, nothing, quat_xyzw), nothing[:0], np.full(len(t_us), np.nan), std_rad, quality)
+
+
+def _trajectory(t_us: np.ndarray, position: np.ndarray, quat_xyzw: np.ndarray) -> Trajectory:
+    quat_wxyz = torch.from_numpy(quat_xyzw[:, [3, 0, 1, 2]].copy())
+    return Trajectory(torch.from_numpy(t_us.copy()), Poses(torch.from_numpy(position.copy()), quat_wxyz))
+
+
+def _tracks(
+    file: RecordingFile, camera: Camera, settings: OdometrySettings, pace: Pace, hot: Bool[np.ndarray, "pixels"],
+    threshold_ratio: float,
+) -> tuple[Tracks, Int64[np.ndarray, "keyframes"]]:  # fmt: skip
+    """Tracks of three keyframes or more, and the keyframes' times, from the first event to the last."""
+    speed_px_s = _USUAL_PX_S
+    for _ in range(2):
+        speed_px_s = _speed_px_s(file, pace, hot, threshold_ratio, settings.memory_px / speed_px_s) or speed_px_s
+    length_s = float(pace.seconds[-1])
+    memory_s = float(np.clip(settings.memory_px / speed_px_s, *_MEMORY_S))
+    keyframe_s = float(np.clip(settings.keyframe_px / speed_px_s, *_KEYFRAME_S))
+    keyframes = max(round(length_s / keyframe_s), _FEWEST_KEYFRAMES)
+    t_us = np.unique(pace.when_us(np.linspace(0, length_s, _IMAGES_A_KEYFRAME * keyframes + 1)))
+    images = event_images(file, pace, t_us, memory_s, threshold_ratio, hot)
+    tracks = followed(images, camera, _IMAGES_A_KEYFRAME)
+    return tracks.select(tracks.lengths()[tracks.track] >= _SHORTEST_TRACK), t_us[::_IMAGES_A_KEYFRAME]
+
+
+def _speed_px_s(
+    file: RecordingFile, pace: Pace, hot: Bool[np.ndarray, "pixels"], threshold_ratio: float, memory_s: float
+) -> float | None:
+    """How fast things usually move across the picture, by a few pairs of pictures; None where nothing is found."""
+    length_s = float(pace.seconds[-1])
+    apart_s = min(_PILOT_S, length_s / 20)
+    memory_s = float(np.clip(memory_s, *_MEMORY_S))
+    speeds = []
+    for moment_s in length_s * (np.arange(_PILOTS) + 0.5) / _PILOTS:
+        t_us = np.unique(pace.when_us(np.array([max(moment_s - 3 * memory_s, 0), moment_s, moment_s + apart_s])))
+        *_, one, two = event_images(file, pace, t_us, memory_s, threshold_ratio, hot)
+        moved_px = displacements_px(one, two)
+        if len(moved_px):
+            speeds.append(float(np.median(moved_px)) / apart_s)
+    return max(float(np.median(speeds)), 1.0) if speeds else None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
     from ebarf_ns.events.recording import RecordingFile
+    from ebarf_ns.odometry.pace import Pace
 
 _SEGMENT_PIXELS, _FEWEST = 1 << 23, 20
 _FORGOTTEN = 4.0
@@ -26,14 +27,15 @@ _BLUR_PX, _CLIPPED_AT = 0.7, 2.5
 
 def event_images(
     file: RecordingFile,
+    pace: Pace,
     t_us: Int64[np.ndarray, "images"],
-    time_constant_us: float,
+    time_constant_s: float,
     threshold_ratio: float = 1.0,
     left_out: Bool[np.ndarray, "pixels"] | None = None,
 ) -> Iterator[UInt8[np.ndarray, "height width"]]:
     """Grey pictures at rising times, mid grey where nothing changes; read a stretch of the recording at a time.
 
-    ``threshold_ratio`` is C_on / C_off; pixels ``left_out`` get the mean of their neighbours.
+    The time constant is on the clock of ``pace``; ``threshold_ratio`` is C_on / C_off; pixels ``left_out`` get the mean of their neighbours.
     """
     width, height = file.width, file.height
     up, down = np.sqrt(threshold_ratio), -1 / np.sqrt(threshold_ratio)
@@ -41,16 +43,18 @@ def event_images(
     segment = max(_SEGMENT_PIXELS // (width * height), _FEWEST)
     for first in range(0, len(t_us), segment):
         times = t_us[first : first + segment]
-        end_us = int(times[-1] + _FORGOTTEN * time_constant_us)
-        events = file.window(done_us, end_us)
+        until_s = float(pace.at(times[-1:])[0]) + _FORGOTTEN * time_constant_s
+        events = file.window(done_us, int(pace.when_us(np.array([until_s]))[0]))
+        if left_out is not None:
+            events = events.select(~left_out[events.pixels(width)])
         now, last = np.searchsorted(events.t_us, [times[0], times[-1]])
         pixel, change = events.pixels(width), np.where(events.polarity > 0, up, down)
-        since_us, at_us = (events.t_us - done_us).astype(float), (times - done_us).astype(float)
-        past = _leaky(pixel[:last], since_us[:last], change[:last], at_us, before, time_constant_us)
-        until_us = float(end_us - done_us)
+        start_s = float(pace.at(np.array([done_us]))[0])
+        event_s, image_s = pace.at(events.t_us), pace.at(times)
+        past = _leaky(pixel[:last], event_s[:last] - start_s, change[:last], image_s - start_s, before, time_constant_s)
         future = _leaky(
-            pixel[now:][::-1], until_us - since_us[now:][::-1], -change[now:][::-1],
-            until_us - at_us[::-1], np.zeros_like(before), time_constant_us,
+            pixel[now:][::-1], until_s - event_s[now:][::-1], -change[now:][::-1],
+            until_s - image_s[::-1], np.zeros_like(before), time_constant_s,
         )  # fmt: skip
         before, done_us = past[-1].copy(), int(times[-1])
         images = (past + future[::-1]).reshape(-1, height, width)
@@ -73,23 +77,23 @@ def _mended(
 @njit(cache=True)
 def _leaky(
     pixel: Int64[np.ndarray, "events"],
-    t_us: Float64[np.ndarray, "events"],
+    t: Float64[np.ndarray, "events"],
     change: Float64[np.ndarray, "events"],
-    at_us: Float64[np.ndarray, "images"],
+    at: Float64[np.ndarray, "images"],
     start: Float32[np.ndarray, "pixels"],
-    time_constant_us: float,
+    time_constant: float,
 ) -> Float32[np.ndarray, "images pixels"]:
     """Sums of changes that decay with the time since them, at rising times; ``start`` is the sum at time 0."""
-    images = np.empty((len(at_us), len(start)), np.float32)
+    images = np.empty((len(at), len(start)), np.float32)
     total = start.astype(np.float64)
-    touched_us = np.zeros(len(start))
+    touched = np.zeros(len(start))
     k = 0
-    for i in range(len(at_us)):
-        while k < len(pixel) and t_us[k] < at_us[i]:
+    for i in range(len(at)):
+        while k < len(pixel) and t[k] < at[i]:
             p = pixel[k]
-            total[p] = total[p] * np.exp((touched_us[p] - t_us[k]) / time_constant_us) + change[k]
-            touched_us[p] = t_us[k]
+            total[p] = total[p] * np.exp((touched[p] - t[k]) / time_constant) + change[k]
+            touched[p] = t[k]
             k += 1
         for p in range(len(start)):
-            images[i, p] = total[p] * np.exp((touched_us[p] - at_us[i]) / time_constant_us)
+            images[i, p] = total[p] * np.exp((touched[p] - at[i]) / time_constant)
     return images

@@ -21,8 +21,7 @@ _GAPS = (5, 8, 12, 18, 27)
 _FEWEST_SHARED, _TRIED, _ENOUGH_PX = 25, 6, 25.0
 _FEWEST_SEEN, _LEAST_SHARE, _INLIER_PX = 12, 0.4, 3.0
 _LOCAL, _BEHIND, _WHOLE_EVERY, _STRETCH = 8, 30, 12, 120
-_ROBUST_PX, _SPARE = 0.7, 3
-DEBUG = False
+_ROBUST_PX, _LOOSE_PX, _SPARE = 0.7, 2.0, 3
 _DEPTHS = np.array([0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 8.0])
 """Inverse depths over the usual one that a new point is tried at."""
 
@@ -151,20 +150,24 @@ def _extended(whole: Map, at: int, step: int) -> bool:
             points_too=False,
         )  # fmt: skip
     whole.posed[new] = True
+    recent, around = (_posed(whole, new, step, count) for count in (_LOCAL, _BEHIND))
+    # Points whose depth nothing told so far learn it from this keyframe: they are no outliers before that.
+    _adjust(whole, recent, around, _LOOSE_PX, rounds=5)
     good = whole.residuals_px(rows) < _INLIER_PX
-    if DEBUG: print('ext',new,len(rows),good.sum(),round(good.mean(),2), np.isfinite(bundle.centre[new]).all())
     if good.sum() < _FEWEST_SEEN or good.mean() < _LEAST_SHARE:
         whole.posed[new] = False
         return False
     _split(whole, rows[~good], step)
     _add_points(whole, usual=float(np.median(bundle.point[tracks.track[rows], 2])))
-    recent = np.arange(new, new - step * _LOCAL, -step)
-    recent = recent[(recent >= 0) & (recent < len(whole.posed))]
-    recent = recent[whole.posed[recent]]
-    around = np.arange(new, new - step * _BEHIND, -step)
-    around = around[(around >= 0) & (around < len(whole.posed))]
-    _adjust(whole, recent, around[whole.posed[around]], _ROBUST_PX, rounds=4)
+    _adjust(whole, recent, around, _ROBUST_PX, rounds=4)
     return True
+
+
+def _posed(whole: Map, last: int, step: int, count: int) -> Int64[np.ndarray, "images"]:
+    """Some keyframes with poses up to one of them."""
+    images = np.arange(last, last - step * count, -step)
+    images = images[(images >= 0) & (images < len(whole.posed))]
+    return images[whole.posed[images]]
 
 
 def _split(whole: Map, rows: Int64[np.ndarray, "rows"], step: int) -> None:

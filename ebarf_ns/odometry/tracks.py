@@ -122,6 +122,17 @@ def _compare(features: _Features, keyframes: dict[int, np.ndarray], picture: np.
     features.template[stale] = features.pixel[stale]
 
 
+def displacements_px(
+    one: UInt8[np.ndarray, "height width"], two: UInt8[np.ndarray, "height width"]
+) -> Float64[np.ndarray, "features"]:
+    """How far the features of a picture have moved in another."""
+    pixel = _corners(one, np.zeros((0, 2), np.float32))
+    if not len(pixel):
+        return np.zeros(0)
+    there, kept = _moved(one, two, pixel)
+    return np.linalg.norm(there - pixel, axis=1)[kept].astype(float)
+
+
 def _moved(before: np.ndarray, after: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where features went, and which of them are found again where they came from when time runs backwards."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, pixel, None, **_SETTINGS)  # pyright: ignore
