@@ -10,7 +10,7 @@ export PATH := $(abspath $(BIN)):$(PATH)
 
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml tools/setup.sh
+$(VENV)/.installed: pyproject.toml constraints.txt tools/setup.sh
 	sh tools/setup.sh $(VENV)
 	touch $@
 

@@ -3,6 +3,8 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
 
 
 class EbarfError(Exception):
@@ -55,6 +57,23 @@ def one_line_errors() -> Iterator[None]:
         raise SystemExit(2) from error
 
 
+def did_you_mean(path: Path) -> str:
+    """The end of a message about a path that leads nowhere: what is there under a name much like it, if anything is."""
+    missing = [one for one in (path, *path.parents) if not one.exists()]
+    if not missing or not missing[-1].parent.is_dir():
+        return ""
+    first = missing[-1]
+    near = get_close_matches(first.name, [one.name for one in first.parent.iterdir()], n=1)
+    if not near:
+        return ""
+    found = first.parent / near[0]
+    whole = found / path.relative_to(first)
+    return f"; did you mean {whole if whole.exists() else found}?"
+
+
 def _what_the_system_says(error: OSError) -> str:
     said = error.strerror or " ".join(str(error).split())
-    return f"{error.filename}: {said}" if error.filename else said
+    if not error.filename:
+        return said
+    near = did_you_mean(Path(error.filename)) if isinstance(error, FileNotFoundError) else ""
+    return f"{error.filename}: {said}{near}"

@@ -69,6 +69,24 @@ def opened_npz(path: Path) -> Iterator[Any]:
         raise ValueError(f"not a whole npz file of plain arrays ({error})") from None
 
 
+def read_picture(path: Path, flags: int = -1) -> np.ndarray | None:
+    """The pixels of an image file by OpenCV's flags, None where it is no image.
+
+    OpenCV opens no file by itself: on Windows it knows only the names of one code page.
+    """
+    import cv2
+
+    content = np.fromfile(path, np.uint8)
+    return cv2.imdecode(content, flags) if len(content) else None
+
+
+def write_picture(path: Path, pixels: np.ndarray) -> None:
+    """An image file of the kind that its name says."""
+    import cv2
+
+    cv2.imencode(path.suffix, pixels)[1].tofile(path)
+
+
 def _umask() -> int:
     current = os.umask(0)
     os.umask(current)

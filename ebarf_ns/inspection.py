@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.evaluation.frames import read_frame
+from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
 from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import Estimate, SensorFacts, identify_recording
@@ -18,6 +17,7 @@ from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.plan import Line, plan_for
+from ebarf_ns.printing import print_facts, print_line
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
 _FEW_EVENTS_PER_PIXEL = 5
@@ -66,15 +66,21 @@ def inspect_scene(folder: Path) -> Summary:
     check_bounds(scene, trajectory)
     if scene.groundtruth:
         read_tum(scene.groundtruth)
+    if scene.missing:
+        raise SceneError(f"{scene.missing[0]}: no such file, expected a validation frame{_and_others(scene)}")
     for frame in scene.frames:
         read_frame(frame)
     summary = _summarize(scene, trajectory)
-    try:
-        check_clocks(scene, (summary.start_us, summary.end_us), trajectory)
-    except SceneError as error:
-        summary.suspicions.append(str(error))
+    check_clocks(scene, (summary.start_us, summary.end_us), trajectory)
+    contradicted = polarity_contradicted(polarity_correlations(scene))
+    summary.suspicions.extend([contradicted] if contradicted else [])
     summary.suspicions.extend(_suspicions(scene, summary, trajectory))
     return summary
+
+
+def _and_others(scene: Scene) -> str:
+    others = len(scene.missing) - 1
+    return f", and {others} more that are named in {scene.folder / 'frames.json'}" if others else ""
 
 
 def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
@@ -157,7 +163,8 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     found.extend(torn(trajectory))
     if scene.bounds is None:
         found.append(
-            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail"
+            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail; where "
+            "you know how far away the farthest thing is, ebarf process has --farthest"
         )
     return found
 
@@ -181,23 +188,11 @@ def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
 
 
 def print_summary(summary: Summary, folder: Path) -> None:
-    """For a person."""
-    console = Console()
-    table = Table(title=str(folder), show_header=False, title_justify="left")
-    for name, value in _lines(summary):
-        table.add_row(name, value)
-    console.print(table)
-    plan = Table(title="plan of training", title_justify="left")
-    plan.add_column("flag", no_wrap=True)
-    plan.add_column("value", no_wrap=True)
-    plan.add_column("because")
+    """For a person: first what looks wrong."""
+    console = print_facts(folder, summary.suspicions, _lines(summary))
+    console.print("\nplan of training, which these flags of ns-train overrule:")
     for line in summary.plan:
-        plan.add_row(line.flag, str(line.value), line.reason)
-    console.print(plan)
-    for suspicion in summary.suspicions:
-        console.print(f"[yellow]![/yellow] {suspicion}")
-    if not summary.suspicions:
-        console.print("[green]nothing suspicious[/green]")
+        print_line(console, f"{line.flag} = {line.value}: {line.reason}")
 
 
 def _range(estimate: Estimate) -> str:
@@ -236,7 +231,7 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
         ("events within it", f"{summary.events_within_trajectory:,} ({within:.1%})"),
         (
             "thresholds",
-            f"stated: on {threshold[0]}, off {threshold[1]}; "
+            f"stated: on {threshold[0]}, off {threshold[1]}"
             if threshold
             else "not stated; " + f"by events that must cancel, on / off is {_range(summary.sensor.threshold_ratio)}",
         ),

@@ -1,14 +1,19 @@
 """How much memory a run has taken."""
 
-import resource
 import sys
 from pathlib import Path
 
 import torch
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 
 def peak_memory_mib(device: str = "cpu") -> float:
-    """Most memory held at once since the process began: on a GPU by torch, else by the process."""
+    """Most memory held at once since the process began: on a GPU by torch, else by the process; 0 where the system does
+    not tell."""
     if device.startswith("cuda"):
         return torch.cuda.max_memory_allocated() / 2**20
     status = Path("/proc/self/status")
@@ -18,5 +23,7 @@ def peak_memory_mib(device: str = "cpu") -> float:
         for line in lines:
             if line.startswith("VmHWM"):
                 return int(line.split()[1]) / 1024
+    if resource is None:
+        return 0.0
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
 
-from ebarf_ns.errors import SceneError
-from ebarf_ns.files import whole_file
+from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera
+from ebarf_ns.json_file import JsonObject, is_number, read_json, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,20 +70,26 @@ class Scene:
     """Of the photoreceptor's low pass, at the mean log brightness of what is seen."""
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner in world units."""
+    missing: tuple[Path, ...] = ()
+    """Files of validation frames that are named and are not there; such frames, or depths, are left out."""
 
 
 def read_scene(folder: Path) -> Scene:
-    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation."""
+    """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation.
+
+    Validation frames may be missing: nothing is learned from them.
+    """
     path = folder / "scene.json"
     if not folder.is_dir():
-        raise SceneError(f"{folder}: no such folder, expected a scene folder with scene.json in it")
-    content = _Object(path, "", _read_json(path))
+        what = "a file" if folder.exists() else "no such folder"
+        raise SceneError(f"{folder}: {what}, expected a scene folder with scene.json in it{did_you_mean(folder)}")
+    content = JsonObject(path, "", read_json(path))
     content.only(_KEYS.split())
     for key, expected in (("format", FORMAT), ("version", VERSION)):
         if content.get(key) != expected:
             raise SceneError(f"{path}: {key} is {content.get(key)!r}, expected {expected!r}")
     camera = _camera(content.object("camera"))
-    frames = content.optional_file("frames")
+    frames, missing = _read_frames(content.optional_file("frames", must_exist=False), camera)
     return Scene(
         folder=folder,
         # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
@@ -94,7 +97,8 @@ def read_scene(folder: Path) -> Scene:
         trajectory=content.file("trajectory"),
         camera=camera,
         groundtruth=content.optional_file("groundtruth"),
-        frames=_read_frames(frames, camera) if frames else (),
+        frames=frames,
+        missing=missing,
         contrast_threshold=_threshold(content.object("contrast_threshold"))
         if content.get("contrast_threshold") is not None
         else None,
@@ -134,7 +138,8 @@ def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajector
     if start_us > last_us or end_us < first_us:
         raise SceneError(
             f"{scene.events}: none of the events, {start_us} to {end_us} us, lies within the span of "
-            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}"
+            f"{scene.trajectory.name}, {first_us} to {last_us} us; {expected}; ebarf process "
+            f"--time-offset-us {first_us - start_us} would let both begin together"
         )
     if among < 2 and last_us - first_us > _LONGEST_SPAN_RATIO * max(end_us - start_us, 1):
         raise SceneError(
@@ -159,8 +164,8 @@ def write_scene(scene: Scene) -> None:
         "bounds": scene.bounds,
     }
     if scene.frames:
-        _write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
-    _write_json(scene.folder / "scene.json", content)
+        write_json(scene.folder / "frames.json", [_frame_json(frame, scene) for frame in scene.frames])
+    write_json(scene.folder / "scene.json", content)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -170,7 +175,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 def write_camera(path: Path, camera: Camera) -> None:
     """Write a camera as ``scene.json`` has it under "camera"."""
-    _write_json(path, _camera_json(camera))
+    write_json(path, _camera_json(camera))
 
 
 def _camera_json(camera: Camera) -> dict[str, Any]:
@@ -192,92 +197,12 @@ def _frame_json(frame: Frame, scene: Scene) -> dict[str, Any]:
     return content
 
 
-def _write_json(path: Path, content: object) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise SceneError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: byte {error.start} is not UTF-8 text") from None
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise SceneError(f"{path}: not valid JSON ({error})") from None
-
-
-class _Object:
-    """A JSON object that knows where it stands, so that every complaint names file and key."""
-
-    def __init__(self, path: Path, place: str, content: object):
-        if not isinstance(content, Mapping):
-            raise SceneError(f"{path}: {place or 'the file'} is {content!r:.40}, expected a JSON object")
-        self.path, self.place, self.content = path, place, content
-
-    def name(self, key: str) -> str:
-        return f"{self.place}.{key}" if self.place else key
-
-    def get(self, key: str) -> Any:
-        return self.content.get(key)
-
-    def only(self, keys: Sequence[str]) -> None:
-        unknown = [key for key in self.content if key not in keys]
-        if unknown:
-            names = ", ".join(self.name(key) for key in unknown)
-            raise SceneError(f"{self.path}: unknown key {names}, expected among: {', '.join(keys)}")
-
-    def wrong(self, key: str, expected: str) -> SceneError:
-        found = repr(self.content[key]) if key in self.content else "missing"
-        return SceneError(f"{self.path}: {self.name(key)} is {found:.80}, expected {expected}")
-
-    def object(self, key: str) -> "_Object":
-        if not isinstance(self.get(key), Mapping):
-            raise self.wrong(key, "a JSON object")
-        return _Object(self.path, self.name(key), self.get(key))
-
-    def file(self, key: str, must_exist: bool = True) -> Path:
-        name = self.get(key)
-        if not isinstance(name, str) or not name:
-            raise self.wrong(key, "a file name")
-        path = self.path.parent / name
-        if must_exist and not path.is_file():
-            raise SceneError(f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}")
-        return path
-
-    def optional_file(self, key: str) -> Path | None:
-        return self.file(key) if self.get(key) is not None else None
-
-    def number(self, key: str, expected: str = "a finite number", positive: bool = False) -> float:
-        value = self.get(key)
-        if not _is_number(value) or (positive and value <= 0):
-            raise self.wrong(key, f"{expected} above 0" if positive else expected)
-        return float(value)
-
-    def integer(self, key: str, positive: bool = False) -> int:
-        value = self.get(key)
-        if not isinstance(value, int) or isinstance(value, bool) or (positive and value <= 0):
-            raise self.wrong(key, "an integer above 0" if positive else "an integer")
-        return value
-
-    def choice(self, key: str, choices: tuple[str, ...]) -> Any:
-        if self.get(key) not in choices:
-            raise self.wrong(key, f"one of {', '.join(choices)}")
-        return self.get(key)
-
-
-def _is_number(value: object) -> bool:
-    # Comparing is safe for integers of any length, which do not fit a float.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-def _camera(content: _Object) -> Camera:
+def _camera(content: JsonObject) -> Camera:
     content.only("model width height fx fy cx cy distortion".split())
     model = content.choice("model", tuple(COEFFICIENTS))
     distortion = content.get("distortion") or []
     counts = COEFFICIENTS[model]
-    if not isinstance(distortion, list) or len(distortion) not in counts or not all(map(_is_number, distortion)):
+    if not isinstance(distortion, list) or len(distortion) not in counts or not all(map(is_number, distortion)):
         raise content.wrong("distortion", f"a list of {' or '.join(map(str, counts))} numbers for model {model}")
     return Camera(
         model=model,
@@ -291,58 +216,65 @@ def _camera(content: _Object) -> Camera:
     )
 
 
-def _threshold(content: _Object) -> ContrastThreshold:
+def _threshold(content: JsonObject) -> ContrastThreshold:
     content.only(["on", "off"])
     return ContrastThreshold(content.number("on", positive=True), content.number("off", positive=True))
 
 
-def _refractory_us(content: _Object) -> int:
+def _refractory_us(content: JsonObject) -> int:
     value = content.integer("refractory_us")
     if not 0 <= value <= _LONGEST_REFRACTORY_US:
         raise content.wrong("refractory_us", f"whole microseconds from 0 to {_LONGEST_REFRACTORY_US}")
     return value
 
 
-def _time_constant_us(content: _Object) -> float:
+def _time_constant_us(content: JsonObject) -> float:
     value = content.number("time_constant_us")
     if not 0 <= value <= _LONGEST_TIME_CONSTANT_US:
         raise content.wrong("time_constant_us", f"microseconds from 0 to {_LONGEST_TIME_CONSTANT_US}")
     return value
 
 
-def _bounds(content: _Object) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _bounds(content: JsonObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
     bounds = content.get("bounds")
     expected = "two corners [[x, y, z], [x, y, z]], the first below the second on every axis"
     if not isinstance(bounds, list) or len(bounds) != 2:
         raise content.wrong("bounds", expected)
     lower, upper = bounds
     for corner in bounds:
-        if not isinstance(corner, list) or len(corner) != 3 or not all(map(_is_number, corner)):
+        if not isinstance(corner, list) or len(corner) != 3 or not all(map(is_number, corner)):
             raise content.wrong("bounds", expected)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise content.wrong("bounds", expected)
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def _read_frames(path: Path, event_camera: Camera) -> tuple[Frame, ...]:
-    content = _read_json(path)
+def _read_frames(path: Path | None, event_camera: Camera) -> tuple[tuple[Frame, ...], tuple[Path, ...]]:
+    """Those that are there, and the files that are not."""
+    if path is None or not path.exists():
+        return (), (path,) if path else ()
+    content = read_json(path)
     if not isinstance(content, list):
         raise SceneError(f"{path}: holds a {type(content).__name__}, expected a list of frames")
-    return tuple(_frame(_Object(path, f"[{k}]", item), event_camera) for k, item in enumerate(content))
+    frames = [_frame(JsonObject(path, f"[{k}]", item), event_camera) for k, item in enumerate(content)]
+    named = [file for frame in frames for file in (frame.path, frame.depth) if file]
+    missing = tuple(file for file in named if not file.is_file())
+    present = [frame for frame in frames if frame.path not in missing]
+    return tuple(replace(one, depth=None) if one.depth in missing else one for one in present), missing
 
 
-def _frame(content: _Object, event_camera: Camera) -> Frame:
+def _frame(content: JsonObject, event_camera: Camera) -> Frame:
     content.only("file t_us camera event_camera_from_frame_camera intensity depth".split())
     extrinsic = content.get("event_camera_from_frame_camera")
     if extrinsic is not None:
         rows = isinstance(extrinsic, list) and len(extrinsic) == 4 and all(isinstance(row, list) for row in extrinsic)
-        if not rows or not all(len(row) == 4 and all(map(_is_number, row)) for row in extrinsic):
+        if not rows or not all(len(row) == 4 and all(map(is_number, row)) for row in extrinsic):
             raise content.wrong("event_camera_from_frame_camera", "a 4x4 matrix of numbers")
     return Frame(
-        path=content.file("file"),
+        path=content.file("file", must_exist=False),
         t_us=content.integer("t_us"),
         camera=_camera(content.object("camera")) if content.get("camera") is not None else event_camera,
         event_camera_from_frame_camera=tuple(tuple(map(float, row)) for row in extrinsic or np.eye(4).tolist()),
         intensity=content.choice("intensity", get_args(FrameIntensity)),
-        depth=content.optional_file("depth"),
+        depth=content.optional_file("depth", must_exist=False),
     )

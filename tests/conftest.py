@@ -2,8 +2,11 @@
 
 import io
 import os
+import socket
 import subprocess
 import sys
+import time
+import urllib.request
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from ebarf_ns.cli.main import entrypoint
+from ebarf_ns.cli.entry import entrypoint
 
 # How long an example takes says more of what else the machine does than of the code.
 settings.register_profile("ebarf", deadline=None)
@@ -72,6 +75,26 @@ def run_ok(*words: object, timeout_s: float = 300, cwd: Path | None = None) -> s
     finished = run_command(*words, timeout_s=timeout_s, cwd=cwd)
     assert finished.code == 0, f"{words}\n{finished.output[-3000:]}\n{finished.errors[-3000:]}"
     return finished.output
+
+
+def wait_for_page(address: str, process: subprocess.Popen, patience_s: float = 120) -> str:
+    """What is served there, as soon as it is."""
+    end = time.monotonic() + patience_s
+    while time.monotonic() < end:
+        assert process.poll() is None, process.stdout.read().decode() if process.stdout else ""
+        try:
+            with urllib.request.urlopen(address, timeout=5) as answer:
+                return answer.read().decode(errors="replace")
+        except OSError:
+            time.sleep(1)
+    raise AssertionError(f"{address} did not answer in {patience_s} s")
+
+
+def free_port() -> int:
+    """One that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="session")

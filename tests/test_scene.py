@@ -94,7 +94,6 @@ def test_wrong_scene_names_file_key_value_and_expectation(tmp_path: Path, scene:
 @pytest.mark.parametrize(
     ("frame", "words"),
     [
-        ({**FRAME, "file": "gone.png"}, "[0].file names 'gone.png'"),
         ({**FRAME, "t_us": 1.5}, "[0].t_us is 1.5, expected an integer"),
         ({**FRAME, "intensity": "gamma"}, "[0].intensity is 'gamma', expected one of linear, srgb, log"),
         ({**FRAME, "event_camera_from_frame_camera": [[1, 0], [0, 1]]}, "expected a 4x4 matrix"),
@@ -117,5 +116,24 @@ def test_broken_json_is_named(tmp_path: Path, content: bytes):
 
 
 def test_missing_folder_is_named(tmp_path: Path):
-    with pytest.raises(SceneError, match="no such folder"):
+    with pytest.raises(SceneError, match="no such folder, expected a scene folder with scene.json in it$"):
         read_scene(tmp_path / "gone")
+
+
+def test_a_folder_of_nearly_that_name_is_offered(tmp_path: Path):
+    (tmp_path / "demo" / "scene").mkdir(parents=True)
+    for typed in ("demo/scen", "demmo/scene"):
+        with pytest.raises(SceneError) as caught:
+            read_scene(tmp_path / typed)
+        assert str(caught.value).endswith(f"; did you mean {tmp_path / 'demo' / 'scene'}?")
+
+
+def test_frames_that_are_not_there_are_left_out_and_listed(tmp_path: Path):
+    frames = [FRAME, {**FRAME, "file": "gone.png"}, {**FRAME, "depth": "gone.npy"}]
+    scene = read_scene(make(tmp_path, frames=frames))
+    assert [frame.path.name for frame in scene.frames] == ["a.png", "a.png"]
+    assert scene.frames[1].depth is None
+    assert [path.name for path in scene.missing] == ["gone.png", "gone.npy"]
+    (tmp_path / "frames.json").unlink()
+    scene = read_scene(tmp_path)
+    assert scene.frames == () and scene.missing == (tmp_path / "frames.json",)

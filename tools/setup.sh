@@ -1,8 +1,10 @@
 #!/bin/sh
-# Creates the virtual environment given as first argument with everything in it, and the system packages that
+# Creates the virtual environment given as first argument with everything in it, of the versions in the file given as
+# second one (constraints.txt where not given; /dev/null for the newest there are), and the system packages that
 # nerfstudio's renderer (ffmpeg) and exporter (libusb, for open3d) need.
 set -eu
 venv=$1
+constraints=${2:-constraints.txt}
 
 find_python() {
     for candidate in ${PYTHON:-python3.11 python3.10 python3.12 python3}; do
@@ -34,4 +36,4 @@ fi
 
 python=$(find_python)
 "$python" -m venv "$venv"
-"$venv/bin/python" -m pip install --quiet --editable '.[dev]'
+"$venv/bin/python" -m pip install --quiet --constraint "$constraints" --editable '.[dev]'

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ebarf_ns.benchmarks.engine import machine
+from ebarf_ns.benchmarks.figures import machine
 from ebarf_ns.benchmarks.manifest import TRUE, Manifest, Other, Stated
 from ebarf_ns.benchmarks.training import train
 from ebarf_ns.errors import BenchmarkError

@@ -9,14 +9,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import platform
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
 from datetime import date
 from importlib.util import find_spec
 from itertools import count
@@ -29,51 +25,26 @@ import h5py
 import numpy as np
 import torch
 
+from ebarf_ns.benchmarks.engine_step import (
+    HEIGHT,
+    WIDTH,
+    Step,
+    device,
+    event_chunks,
+    event_index,
+    median_seconds,
+    renderer,
+)
+from ebarf_ns.benchmarks.figures import Figure, machine, shown
 from ebarf_ns.benchmarks.settings import PARTS, EngineBenchmark, Part
-from ebarf_ns.events.pairs import DrawAhead, HeldoutBlocks, PairIndex, batch_random, index_pairs
-from ebarf_ns.events.recording import Recording
-from ebarf_ns.files import whole_file
-from ebarf_ns.geometry.so3 import quat_wxyz_exp, rotate
-from ebarf_ns.geometry.trajectory import Interpolation, Poses, corrected, interpolate
-from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
-from ebarf_ns.photometry.brightness import log_brightness
-from ebarf_ns.photometry.event_loss import reported_change, threshold_loss
-from ebarf_ns.radiance.field import RadianceField, fastest_precision
-from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape, encode_reference, fastest_carrier
+from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.radiance.field import fastest_precision
+from ebarf_ns.radiance.hash_grid import HashGrid, encode_reference, fastest_carrier
+from ebarf_ns.radiance.lattice import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
-from ebarf_ns.radiance.renderer import Renderer, Sampling
 
-WIDTH, HEIGHT, FOCAL_PX = 128, 96, 110.0
 _ROUNDS = 3
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One measured number and, where there is one, what it should reach."""
-
-    what: str
-    value: float | None
-    unit: str
-    at_least: float | None = None
-    at_most: float | None = None
-
-    @property
-    def verdict(self) -> str:
-        """Whether the target is met; empty where there is none."""
-        if self.value is None:
-            return "not measured"
-        if self.at_least is not None:
-            return "reached" if self.value >= self.at_least else "missed"
-        if self.at_most is not None:
-            return "reached" if self.value <= self.at_most else "missed"
-        return ""
-
-    @property
-    def target(self) -> str:
-        """For a person."""
-        if self.at_least is not None:
-            return f">= {self.at_least:g}"
-        return f"<= {self.at_most:g}" if self.at_most is not None else ""
 
 
 def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
@@ -83,12 +54,12 @@ def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] =
         say(f"measuring {part}")
         for figure in getattr(_Engine(settings), part)():
             figures.append({**vars(figure), "verdict": figure.verdict})
-            say(f"  {figure.what}: {_shown(figure.value)} {figure.unit} {figure.target} {figure.verdict}")
+            say(f"  {figure.what}: {shown(figure.value)} {figure.unit} {figure.target} {figure.verdict}")
     return {
         "date": date.today().isoformat(),
         "machine": machine(),
-        "carrier": fastest_carrier(torch.zeros(0, 3, device=_device())),
-        "precision": fastest_precision(_device()),
+        "carrier": fastest_carrier(torch.zeros(0, 3, device=device())),
+        "precision": fastest_precision(device()),
         "versions": {"torch": torch.__version__, "numpy": np.__version__},
         "quick": settings.quick,
         "figures": figures,
@@ -106,8 +77,8 @@ class _Engine:
         """Forward and backward with position gradients: the fastest carrier, the torch reference, nerfstudio's."""
         count = 1_000 if self.quick else 100_000
         shape = HashGridShape(levels=16, features=2, coarsest=16, finest=1024, table_size_log2=19)
-        grid = HashGrid(shape).to(_device())
-        point = torch.rand(count, 3, device=_device())
+        grid = HashGrid(shape).to(device())
+        point = torch.rand(count, 3, device=device())
         name = f"hash grid 16 x 2, {count:,} points, forward + backward"
         reference = self._both_ways(
             lambda at: encode_reference(at, grid.table, grid.lattice), point, list(grid.parameters()), few=True
@@ -117,7 +88,7 @@ class _Engine:
         if find_spec("nerfstudio"):
             from ebarf_ns.nerf.comparison import hash_encoding
 
-            theirs_encode, theirs_parameters = hash_encoding(shape, _device())
+            theirs_encode, theirs_parameters = hash_encoding(shape, device())
         # In turns: whatever else the machine does meets both.
         rounds = []
         for _ in range(1 if self.quick else _ROUNDS):
@@ -126,7 +97,7 @@ class _Engine:
             rounds.append((ours, theirs, theirs / ours))
         ours, theirs, ratio = (median(column) for column in zip(*rounds, strict=True))
         yield Figure(f"{name}, {fastest_carrier(point)}", 1e3 * ours, "ms")
-        if _device() == "cuda":
+        if device() == "cuda":
             # Each corner is read, read again and added to; points and features come and go once.
             moved = count * 16 * (8 * 2 * 4 * 4 + 2 * 2 * 4) + count * 3 * 4 * 3
             yield Figure(f"{name}, corner traffic at copy bandwidth", 1e3 * moved / _copy_bandwidth(), "ms")
@@ -141,36 +112,36 @@ class _Engine:
         def once() -> None:
             torch.autograd.grad(encode(point), [*parameters, point], weight)
 
-        return _seconds(once, 3 if few else self._repetitions)
+        return median_seconds(once, 3 if few else self._repetitions)
 
     def step(self) -> Iterator[Figure]:
         """Training steps without nerfstudio around them, and the sampler beside them."""
-        index = _index(10_000 if self.quick else 1_000_000)
-        for pairs in (512,) if _device() == "cpu" or self.quick else (4096, 16384, 65536):
-            step = _Step(index, pairs)
-            seconds = _seconds(step.once, self._repetitions)
+        index = event_index(10_000 if self.quick else 1_000_000)
+        for pairs in (512,) if device() == "cpu" or self.quick else (4096, 16384, 65536):
+            step = Step(index, pairs)
+            seconds = median_seconds(step.once, self._repetitions)
             yield Figure(f"step of {pairs:,} pairs", 1e3 * seconds, "ms")
             yield Figure(f"pairs per second, {pairs:,} a step", pairs / seconds, "pairs/s")
             # As in training: threads of its own, one on a CPU and four beside a GPU.
-            ahead, batches = DrawAhead(step.draw, ahead=1 if _device() == "cpu" else 4), count()
-            drawn = _seconds(lambda take=ahead.batch, of=batches: take(next(of)), 20 * self._repetitions)
+            ahead, batches = DrawAhead(step.draw, ahead=1 if device() == "cpu" else 4), count()
+            drawn = median_seconds(lambda take=ahead.batch, of=batches: take(next(of)), 20 * self._repetitions)
             yield Figure(f"sampler's speed over the step's, {pairs:,} pairs", seconds / drawn, "times", at_least=5)
 
     def scaling(self) -> Iterator[Figure]:
         """Exponent of the seconds a step takes as one kind of work grows: 1 is linear, 0 is flat."""
-        index = _index(10_000 if self.quick else 1_000_000)
-        sweeps: dict[str, tuple[list[int], Callable[[int], _Step]]] = {
-            "pairs per batch": ([256, 1024, 4096, 16384], lambda n: _Step(index, n)),
-            "samples": ([8, 16, 32, 64], lambda n: _Step(index, samples=n)),
-            "levels": ([4, 8, 16], lambda n: _Step(index, levels=n)),
-            "keyframes": ([10, 100, 1_000, 10_000], lambda n: _Step(index, keyframes=n)),
-            "events": ([100_000, 1_000_000, 10_000_000, 100_000_000], lambda n: _Step(_index(n))),
+        index = event_index(10_000 if self.quick else 1_000_000)
+        sweeps: dict[str, tuple[list[int], Callable[[int], Step]]] = {
+            "pairs per batch": ([256, 1024, 4096, 16384], lambda n: Step(index, n)),
+            "samples": ([8, 16, 32, 64], lambda n: Step(index, samples=n)),
+            "levels": ([4, 8, 16], lambda n: Step(index, levels=n)),
+            "keyframes": ([10, 100, 1_000, 10_000], lambda n: Step(index, keyframes=n)),
+            "events": ([100_000, 1_000_000, 10_000_000, 100_000_000], lambda n: Step(event_index(n))),
         }
         for name, (all_sizes, make) in sweeps.items():
             sizes = all_sizes[:2] if self.quick else all_sizes
             seconds = []
             for size in sizes:
-                seconds.append(_seconds(make(size).once, self._repetitions))
+                seconds.append(median_seconds(make(size).once, self._repetitions))
                 yield Figure(f"step with {size:,} {name}", 1e3 * seconds[-1], "ms")
             slope = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
             flat = name in ("keyframes", "events")
@@ -179,17 +150,17 @@ class _Engine:
     def frame(self) -> Iterator[Figure]:
         """A DAVIS346's frame."""
         width, height = (34, 26) if self.quick else (346, 260)
-        renderer = _renderer(16, 8).eval()
+        frame_renderer = renderer(16, 8).eval()
         x, y = torch.meshgrid(torch.arange(width) / width - 0.5, torch.arange(height) / width - 0.4, indexing="xy")
-        direction = torch.stack([x, y, torch.ones_like(x)], dim=-1).flatten(0, 1).to(_device())
+        direction = torch.stack([x, y, torch.ones_like(x)], dim=-1).flatten(0, 1).to(device())
         rays = Rays(torch.zeros_like(direction), torch.nn.functional.normalize(direction, dim=-1))
 
         @torch.no_grad()
         def once() -> None:
             for start in range(0, len(direction), 4096):
-                renderer(Rays(*(column[start : start + 4096] for column in rays)))
+                frame_renderer(Rays(*(column[start : start + 4096] for column in rays)))
 
-        yield Figure(f"a {width} x {height} frame", _seconds(once, self._repetitions), "s", at_most=1.5)
+        yield Figure(f"a {width} x {height} frame", median_seconds(once, self._repetitions), "s", at_most=1.5)
 
     def simulator(self) -> Iterator[Figure]:
         """A second of handheld motion before a DAVIS240C, from command to scene folder but for the imports."""
@@ -266,98 +237,11 @@ class _Engine:
         yield Figure("peak memory of training, largest", max(memory), "GiB", at_most=2)
 
 
-class _Step:
-    """One training step from events to updated field and poses, of the core rooms alone."""
-
-    def __init__(self, index: PairIndex, pairs: int = 512, samples: int = 16, levels: int = 8, keyframes: int = 41):
-        torch.manual_seed(0)
-        self.index, self.pairs = index, pairs
-        self.heldout = HeldoutBlocks(0, 2_000_000, 0.05)
-        self.renderer = _renderer(samples, levels)
-        rows, columns = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-        plane = torch.stack([(columns - WIDTH / 2) / FOCAL_PX, (rows - HEIGHT / 2) / FOCAL_PX], dim=-1).flatten(0, 1)
-        bearing = torch.cat([plane, torch.ones(len(plane), 1)], dim=-1)
-        self.bearing = torch.nn.functional.normalize(bearing, dim=-1).to(_device())
-        self.keyframe_t_us = torch.linspace(0, 2_000_000, keyframes).long().to(_device())
-        wiggle = torch.sin(torch.linspace(0, 6, keyframes))[:, None] * torch.tensor([0.2, 0.1, 0.05])
-        self.start = Poses(wiggle.to(_device()), quat_wxyz_exp(wiggle).to(_device()))
-        self.correction = torch.zeros(keyframes, 6, device=_device(), requires_grad=True)
-        adam = torch.optim.Adam(self.renderer.parameters(), lr=1e-2, betas=(0.9, 0.99), eps=1e-15, fused=True)
-        has_scipy = find_spec("scipy") is not None
-        self.optimizers = adam, KeyframeAdam([self.correction], stretches=has_scipy)
-        self.interpolation: Interpolation = "cubic" if has_scipy else "linear"
-        self.random = torch.Generator()
-        self.number = 0
-
-    def draw(self, batch: int) -> Any:
-        """Event pairs, as in training."""
-        return self.index.draw_accepted(self.pairs, 30, batch_random(0, batch), self.heldout.training)
-
-    def once(self) -> None:
-        """Event pairs, poses, rays, intensities, difference, loss, gradients, update."""
-        self.renderer.begin_step(self.number, self.random)
-        drawn = self.draw(self.number)
-        t_us = torch.from_numpy(np.r_[drawn.t0_us, drawn.t1_us]).to(_device())
-        keyframes = corrected(self.start, self.correction / FOCAL_PX)
-        poses = interpolate(self.keyframe_t_us, keyframes, t_us, self.interpolation)
-        bearing = self.bearing[torch.from_numpy(drawn.pixel).to(_device())].repeat(2, 1)
-        rendered = self.renderer(Rays(poses.position, rotate(poses.quat_wxyz, bearing)), self.random)
-        before, after = log_brightness(rendered.intensity, "log").chunk(2)
-        polarity_sum, event_count, variance = (
-            torch.from_numpy(column).to(_device()) for column in (drawn.polarity_sum, drawn.event_count, drawn.variance)
-        )
-        reported = reported_change(polarity_sum, event_count, 0.25, 0.25).to(before)
-        threshold_loss(after - before, reported, variance.to(before), 0.25).backward()
-        for optimizer in self.optimizers:
-            optimizer.step()
-            optimizer.zero_grad()
-        self.number += 1
-
-
-def _renderer(samples: int, levels: int) -> Renderer:
-    shape = HashGridShape(levels=levels, features=4, coarsest=8, finest=192, table_size_log2=15)
-    field_ = RadianceField(shape, bounded=True, precision=fastest_precision(_device()))
-    return Renderer(field_, Sampling(samples)).to(_device())
-
-
-def _device() -> str:
-    return "cuda" if torch.cuda.is_available() else "cpu"
-
-
-def _seconds(once: Callable[[], object], repetitions: int) -> float:
-    """Median time after two calls to warm up."""
-    times = []
-    for _ in range(repetitions + 2):
-        started = perf_counter()
-        once()
-        if _device() == "cuda":
-            torch.cuda.synchronize()
-        times.append(perf_counter() - started)
-    return median(times[2:])
-
-
 def _copy_bandwidth() -> float:
     """Bytes read and written a second by a copy within the GPU's memory."""
     source = torch.empty(1 << 28, device="cuda")
     target = torch.empty_like(source)
-    return 2 * source.numel() * 4 / _seconds(lambda: target.copy_(source), 9)
-
-
-def _some_events(begin: int, count: int, total: int) -> Recording:
-    """Events ``begin`` to ``begin + count`` of a recording of 2 s in which every pixel takes part."""
-    random = np.random.default_rng(begin)
-    t_us = (np.arange(begin, begin + count) * (2_000_000 / total)).astype(np.int64)
-    columns = (random.integers(0, WIDTH, count, np.uint16), random.integers(0, HEIGHT, count, np.uint16))
-    return Recording(*columns, t_us, random.choice(np.array([-1, 1], np.int8), count))
-
-
-def _chunks(total: int) -> Iterator[Recording]:
-    size = 1 << 22
-    return (_some_events(begin, min(size, total - begin), total) for begin in range(0, total, size))
-
-
-def _index(events: int) -> PairIndex:
-    return index_pairs(lambda: _chunks(events), WIDTH, HEIGHT)
+    return 2 * source.numel() * 4 / median_seconds(lambda: target.copy_(source), 9)
 
 
 def _write_events(path: Path, events: int) -> None:
@@ -365,7 +249,7 @@ def _write_events(path: Path, events: int) -> None:
         dtypes = {"x": "u2", "y": "u2", "t": "i8", "p": "u1"}
         x, y, t, p = (file.create_dataset(f"events/{name}", (events,), dtype) for name, dtype in dtypes.items())
         begin = 0
-        for chunk in _chunks(events):
+        for chunk in event_chunks(events):
             rows = slice(begin, begin + len(chunk))
             x[rows], y[rows], t[rows], p[rows] = chunk.x, chunk.y, chunk.t_us, chunk.polarity > 0
             begin += len(chunk)
@@ -388,7 +272,7 @@ def _measure_index(path: Path, memory_gib: float) -> dict[str, float]:
     index = index_pairs(file.chunks, WIDTH, HEIGHT, int(memory_gib * 2**30))
     seconds = perf_counter() - started
     step = HeldoutBlocks(0, 2_000_000, 0.05)
-    batch = _seconds(lambda: index.draw_accepted(512, 30, batch_random(0, 0), step.training), 30)
+    batch = median_seconds(lambda: index.draw_accepted(512, 30, batch_random(0, 0), step.training), 30)
     return {"seconds": seconds, "peak_gib": peak_memory_mib() / 1024, "batch_ms": 1e3 * batch}
 
 
@@ -399,38 +283,6 @@ def _demo_scene(folder: Path, seed: int, quick: bool) -> Path:
     small = {"width": 48, "height": 36, "focal_px": 41.0, "duration_s": 0.5, "frames": 3} if quick else {}
     simulate(Simulation(seed=seed, **small), scene, lambda _: None)
     return scene
-
-
-def machine() -> str:
-    """Processor or GPU, for people."""
-    if torch.cuda.is_available():
-        return f"one {torch.cuda.get_device_name()}"
-    name = platform.processor() or platform.machine()
-    with suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), name)
-    return f"{os.cpu_count()} cores of {name}"
-
-
-def _shown(value: float | None) -> str:
-    if value is None or not math.isfinite(value):
-        return "-"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def table(result: dict[str, Any]) -> str:
-    """The figures, as Markdown."""
-    lines = [f"{result['machine']}, {result['date']}", "", "| what | measured | target | |", "|---|---|---|---|"]
-    for one in result["figures"]:
-        figure = Figure(**{name: value for name, value in one.items() if name != "verdict"})
-        lines.append(f"| {figure.what} | {_shown(figure.value)} {figure.unit} | {figure.target} | {figure.verdict} |")
-    return "\n".join(lines)
-
-
-def write(result: dict[str, Any], path: Path) -> None:
-    """Keep the figures as JSON."""
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 def main(words: list[str]) -> None:

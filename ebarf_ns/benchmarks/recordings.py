@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ebarf_ns.benchmarks.engine import Figure, machine
+from ebarf_ns.benchmarks.figures import Figure, machine
 from ebarf_ns.benchmarks.settings import RecordingsBenchmark
 from ebarf_ns.formats.intake import Intake, take_in
 from ebarf_ns.formats.recognise import open_recording

@@ -1,8 +1,10 @@
 """The ``ebarf`` command: arguments in, one call, a message out."""
 
 import json
+import os
 import sys
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +14,9 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
-from ebarf_ns.errors import EbarfError, RecordingError, SceneError, one_line_errors
+from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
 from ebarf_ns.formats.process import Format, ProcessSettings
+from ebarf_ns.formats.source import TimeUnit
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
@@ -88,6 +91,10 @@ class Inspect:
     """Of a recording: a PNG to make, with the events of some moments."""
     part: str | None = None
     """Of a recording: the group of an HDF5 file or the topic of a bag that has the events, where several have."""
+    event_time_unit: TimeUnit | None = None
+    """Of a recording: the unit of its times, where it does not say so."""
+    event_columns: str | None = None
+    """Of a recording: the order of columns without names, such as 'x y p t'."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -95,6 +102,10 @@ class Inspect:
         """Print the summary."""
         from ebarf_ns.formats.recognise import recognised_folder
 
+        if not self.scene.exists():
+            raise SceneError(
+                f"{self.scene}: no such file or folder, expected a scene or a recording{did_you_mean(self.scene)}"
+            )
         # A folder that is neither is taken for a scene, and told what it lacks.
         if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
             summary = self._recording()
@@ -109,7 +120,9 @@ class Inspect:
 
         if self.picture and self.picture.suffix.lower() != ".png":
             raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
-        opened = lambda: open_recording(self.scene, part=self.part)  # noqa: E731
+        opened = partial(
+            open_recording, self.scene, part=self.part, time_unit=self.event_time_unit, columns=self.event_columns
+        )
         summary = inspect_recording(opened)
         if self.picture:
             contact_sheet(opened, summary, self.picture)
@@ -242,7 +255,8 @@ class Bench:
             sys.stdout.write(shown + "\n")
 
     def _engine(self) -> tuple[dict[str, Any], str]:
-        from ebarf_ns.benchmarks.engine import run_engine_benchmark, table, write
+        from ebarf_ns.benchmarks.engine import run_engine_benchmark
+        from ebarf_ns.benchmarks.figures import table, write
 
         result = run_engine_benchmark(self.engine, _stderr.print)
         if self.output:
@@ -250,7 +264,7 @@ class Bench:
         return result, table(result)
 
     def _recordings(self) -> tuple[dict[str, Any], str]:
-        from ebarf_ns.benchmarks.engine import table, write
+        from ebarf_ns.benchmarks.figures import table, write
         from ebarf_ns.benchmarks.recordings import run_recordings_benchmark
 
         result = run_recordings_benchmark(self.recordings, _stderr.print)
@@ -261,7 +275,8 @@ class Bench:
     def _comparison(self) -> tuple[dict[str, Any], str]:
         from ebarf_ns.benchmarks.comparison import run_comparison
         from ebarf_ns.benchmarks.manifest import read_manifest
-        from ebarf_ns.evaluation.diagrams import tables, write_diagrams
+        from ebarf_ns.evaluation.comparison_tables import tables
+        from ebarf_ns.evaluation.diagrams import write_diagrams
 
         manifest = read_manifest(Path(self.what))
         folder = self.output or Path("bench") / manifest.name
@@ -288,7 +303,7 @@ def _refuse_existing(output: Path) -> None:
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise SceneError(f"{output}: exists, expected a new folder; remove it first where it is not needed")
     # The finished folder takes the place of an empty one, which these cannot give up.
-    if output.exists() and (output.is_mount() or output.samefile(Path.cwd())):
+    if output.exists() and (os.path.ismount(output) or output.samefile(Path.cwd())):
         raise SceneError(f"{output}: the current folder or a mounted one, expected a new folder, which may be in it")
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 
 from ebarf_ns.errors import EvaluationError
+from ebarf_ns.files import read_picture
 from ebarf_ns.scene import Frame
 
 _DARKEST = 1e-3
@@ -48,7 +49,7 @@ def read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
     # OpenCV reads EXR only when asked to; it looks here at its first image.
     os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
     try:
-        pixels = np.load(path, allow_pickle=False) if path.suffix == ".npy" else cv2.imread(str(path), -1)
+        pixels = np.load(path, allow_pickle=False) if path.suffix == ".npy" else read_picture(path)
     except (cv2.error, ValueError, OSError, EOFError) as error:
         raise EvaluationError(f"{path}: cannot be read as an image ({str(error).splitlines()[0]:.80})") from None
     if pixels is None or pixels.ndim not in (2, 3):

@@ -221,6 +221,36 @@ def errors_under_each_alignment(
     return errors, reasons
 
 
+@dataclass(frozen=True)
+class ErrorsOverTime:
+    """Pose by pose, after one alignment of positions (sim3, else by orientation and scale) and one of rotations."""
+
+    t_us: Int64[np.ndarray, "poses"]
+    position_m: Float[np.ndarray, "poses"]
+    rotation_deg: Float[np.ndarray, "poses"]
+
+
+def errors_over_time(estimate: Trajectory, reference: Trajectory) -> ErrorsOverTime | None:
+    """How far each pose within the reference's span is off; None where no alignment is defined."""
+    try:
+        estimated, true = _matched(estimate, reference)
+        turned, straight = _rotations(estimated), _rotations(true)
+        try:
+            _umeyama(estimated, true, correct_scale=True)
+        except EvaluationError:
+            _align_by_orientation(estimated, true)
+    except EvaluationError:
+        return None
+    world = (straight * turned.inv()).mean()
+    t_us = estimate.t_us.numpy()
+    inside = (t_us >= int(reference.t_us[0])) & (t_us <= int(reference.t_us[-1]))
+    return ErrorsOverTime(
+        t_us[inside],
+        np.linalg.norm(np.asarray(estimated.positions_xyz) - np.asarray(true.positions_xyz), axis=1),
+        np.degrees(((world * turned).inv() * straight).magnitude()),
+    )
+
+
 def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_us: Int64[Tensor, "times"]) -> Poses:
     """The reference's poses at ``t_us``, moved into the estimate's world by the inverse of the sim3 alignment.
 

@@ -8,10 +8,7 @@ Batches are a function of (seed, batch number) alone.
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,14 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.pixels import dead_pixels, hot_pixels
-from ebarf_ns.events.recording import Recording
-
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int64, Shaped, UInt8
+    from jaxtyping import Bool, Float, Int64, Shaped
 
-_EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
+EVENT = np.dtype([("t_us", "<i8"), ("running_polarity", "<i4")])
 """Side by side, so that looking an event up touches one place in memory."""
 _ROUNDS = 100
 _MOST_MISSED = 3.0
@@ -133,15 +126,13 @@ class PairIndex:
         """The same events, those of some pixels counting for nothing."""
         counts = np.zeros(len(pixels), np.int64)
         counts[self.busiest] = -self._less_events
-        return _counting(
-            self.events, self.first, np.where(pixels, 0, counts), self.responsive[~pixels[self.responsive]]
-        )
+        return counting(self.events, self.first, np.where(pixels, 0, counts), self.responsive[~pixels[self.responsive]])
 
     def with_hot_pixels(self) -> PairIndex:
         """The same events, those of hot pixels counting like all others."""
         counts = np.diff(self.first)
         hot = np.setdiff1d(np.nonzero(counts)[0], self.responsive)
-        return _counting(self.events, self.first, counts, np.union1d(self.responsive, hot))
+        return counting(self.events, self.first, counts, np.union1d(self.responsive, hot))
 
     def draw(
         self, steps: Int64[np.ndarray, "pairs"], random: np.random.Generator, refractory_us: int = 0
@@ -300,157 +291,12 @@ def missed_after(events, k, first, refractory_us):
     return polarity * refractory_us / max(interval_us - refractory_us, refractory_us / _MOST_MISSED)
 
 
-def index_pairs(
-    chunks: Callable[[], Iterable[Recording]],
-    width: int,
-    height: int,
-    memory_bytes: int = 1 << 62,
-    doubles_us: int = 0,
-) -> PairIndex:
-    """Order events by pixel and time; ``chunks`` gives them in order of time, and is asked twice or more.
-
-    Events that repeat the one before within ``doubles_us`` at their pixel, with its polarity, are left out.
-
-    An index beyond ``memory_bytes`` lives in a temporary file, and is made a part of the sensor at a time, with one
-    more pass through the events for each part. Raises :class:`RecordingError` when no pixel has two events.
-    """
-    pixels = width * height
-    counts = np.zeros(pixels, np.int64)
-    for chunk in chunks():
-        counts += np.bincount(chunk.pixels(width), minlength=pixels)
-    first = np.r_[0, counts.cumsum()]
-    total = int(first[-1])
-    if counts.max() < 2:
-        raise RecordingError(f"none of the {total:,} events has another one at its pixel: no pair to train on")
-    in_memory = total * _EVENT.itemsize <= memory_bytes
-    events = np.empty(total, _EVENT) if in_memory else _file_backed(total)
-    at_once = total if in_memory else memory_bytes // _EVENT.itemsize
-    begin = 0
-    while begin < pixels:
-        end = max(int(np.searchsorted(first, first[begin] + at_once, side="right")) - 1, begin + 1)
-        end = min(end, pixels)
-        part = events[first[begin] : first[end]]
-        free, sums = first[begin:end] - first[begin], np.zeros(end - begin, np.int32)
-        for chunk in chunks():
-            _place(chunk.pixels(width), chunk.t_us, chunk.polarity, begin, free, sums, part)
-        begin = end
-    if doubles_us:
-        first = _drop_doubles(events, first, doubles_us)
-        events, counts = events[: first[-1]], np.diff(first)
-    hot = hot_pixels(counts, width)
-    responsive = np.nonzero(~hot & ~dead_pixels(counts, width))[0]
-    return _counting(events, first, np.where(hot, 0, counts), responsive)
-
-
-@njit(cache=True)
-def _drop_doubles(events, first, doubles_us):
-    """Close the gaps that they leave, in place; returns where each pixel's events begin then."""
-    kept, new_first = 0, np.zeros_like(first)
-    for pixel in range(len(first) - 1):
-        dropped, before, sum_before, last_us = 0, 0, 0, 0
-        for k in range(first[pixel], first[pixel + 1]):
-            t_us, running = events[k].t_us, events[k].running_polarity
-            polarity, sum_before = running - sum_before, running
-            if polarity == before and t_us - last_us <= doubles_us:
-                dropped += polarity
-                continue
-            before, last_us = polarity, t_us
-            events[kept].t_us, events[kept].running_polarity = t_us, running - dropped
-            kept += 1
-        new_first[pixel + 1] = kept
-    return new_first
-
-
-def _counting(events: np.ndarray, first: np.ndarray, counted: np.ndarray, responsive: np.ndarray) -> PairIndex:
+def counting(events: np.ndarray, first: np.ndarray, counted: np.ndarray, responsive: np.ndarray) -> PairIndex:
+    """An index in which each pixel counts for ``counted`` events."""
     busiest = np.argsort(-counted, kind="stable")
     return PairIndex(events, first, busiest, np.r_[0, counted[busiest].cumsum()], responsive)
-
-
-def _file_backed(count: int) -> np.ndarray:
-    # Without a name: the space is free again when the process ends, however it ends.
-    size = count * _EVENT.itemsize
-    try:
-        file = tempfile.TemporaryFile()
-        # All of it now: a disk that turns out full when a mapped page is written ends the process without a word.
-        os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
-        return np.memmap(file, _EVENT, "r+", shape=(count,))
-    except OSError as error:
-        raise RecordingError(
-            f"{tempfile.gettempdir()}: no room for an index of {size / 2**30:.1f} GiB ({error.strerror}); "
-            "expected TMPDIR to name a larger disk, or --pipeline.datamanager.index-memory-gib to be larger"
-        ) from None
-
-
-@njit(cache=True, nogil=True)
-def _place(pixel, t_us, polarity, begin, free, sums, part):
-    """Counting sort: each event of the pixels from ``begin`` on goes to its pixel's next free place."""
-    for i in range(len(pixel)):
-        p = pixel[i] - begin
-        if 0 <= p < len(free):
-            sums[p] += polarity[i]
-            part[free[p]]["t_us"] = t_us[i]
-            part[free[p]]["running_polarity"] = sums[p]
-            free[p] += 1
-
-
-@dataclass(frozen=True)
-class HeldoutBlocks:
-    """``blocks`` evenly spaced windows that together cover ``share`` of the time from ``start_us`` to ``end_us``."""
-
-    start_us: int
-    end_us: int
-    share: float
-    blocks: int = 20
-
-    def contain(self, t_us: Int64[np.ndarray, "*batch"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether each time lies in one of the windows."""
-        phase = (t_us - self.start_us) / max(self.end_us - self.start_us, 1) * self.blocks % 1
-        return np.abs(phase - 0.5) < self.share / 2
-
-    def middle_s(self, number: int) -> float:
-        """The middle of a window, in seconds."""
-        return round((self.start_us + (number + 0.5) * (self.end_us - self.start_us) / self.blocks) * 1e-6, 3)
-
-    def number(self, t_us: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
-        """In or nearest to which window each time lies."""
-        return ((t_us - self.start_us) * self.blocks // max(self.end_us - self.start_us, 1)).clip(0, self.blocks - 1)
-
-    def training(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
-        """Pairs that begin and end outside; their sums count the events in between all the same."""
-        return ~(self.contain(pairs.t0_us) | self.contain(pairs.t1_us))
-
-    def heldout(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
-        """Pairs that end inside."""
-        return self.contain(pairs.t1_us)
-
-
-class DrawAhead:
-    """Draws the next ``ahead`` batches, numbered ``stride`` apart, in threads of its own while one is used."""
-
-    def __init__(self, draw: Callable[[int], EventPairs], stride: int = 1, ahead: int = 1):
-        self._draw, self._stride, self._ahead = draw, stride, ahead
-        self._workers = ThreadPoolExecutor(ahead, thread_name_prefix="event pairs")
-        self._drawn: dict[int, Future[EventPairs]] = {}
-
-    def batch(self, number: int) -> EventPairs:
-        """Batch ``number``, waited for where it was not one of those expected."""
-        wanted = [number + k * self._stride for k in range(self._ahead + 1)]
-        self._drawn = {k: self._drawn.get(k) or self._workers.submit(self._draw, k) for k in wanted}
-        return self._drawn.pop(number).result()
 
 
 def draw_steps(count: int, longest: int, random: np.random.Generator) -> Int64[np.ndarray, "pairs"]:
     """Steps between the events of a pair: log-uniform over 1 to ``longest``."""
     return np.exp(random.random(count) * np.log(longest + 1)).astype(np.int64)
-
-
-def batch_random(seed: int, batch: int) -> np.random.Generator:
-    """The random numbers of batch number ``batch`` of ``seed``: counter-based, so that no batch depends on another."""
-    return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, batch]))
-
-
-def accumulate(recording: Recording, width: int, height: int) -> UInt8[np.ndarray, "height width"]:
-    """A grey picture of the events: mid-grey where there are none, brighter or darker by the polarities' sum."""
-    picture = np.zeros(width * height, np.int64)
-    np.add.at(picture, recording.pixels(width), recording.polarity)
-    return (128 + np.clip(32 * picture, -128, 127)).astype(np.uint8).reshape(height, width)

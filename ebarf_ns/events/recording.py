@@ -16,7 +16,7 @@ from ebarf_ns.errors import RecordingError
 from ebarf_ns.files import whole_file
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Int8, Int64, UInt16
+    from jaxtyping import Bool, Int8, Int64, UInt8, UInt16
 
 with suppress(ImportError):
     import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5
@@ -152,9 +152,10 @@ class RecordingFile:
         ):
             if wrong.any():
                 row = int(wrong.argmax())
+                others = f" ({np.count_nonzero(wrong):,} such rows of the {len(t):,} from row {begin} on)"
                 raise RecordingError(
-                    f"{self.path}: /events/{name} row {begin + row} is {piece[name][row]}, expected {expected} "
-                    f"({np.count_nonzero(wrong):,} such rows of the {len(t):,} from row {begin} on)"
+                    f"{self.path}: /events/{name} row {begin + row} is {piece[name][row]}, expected {expected}"
+                    f"{others if len(t) > 1 else ''}"
                 )
 
 
@@ -220,3 +221,10 @@ def _columns(file: h5py.File) -> dict[str, h5py.Dataset]:
 def _append(column: h5py.Dataset, values: np.ndarray) -> None:
     column.resize((len(column) + len(values),))
     column[len(column) - len(values) :] = values
+
+
+def accumulate(recording: Recording, width: int, height: int) -> UInt8[np.ndarray, "height width"]:
+    """A grey picture of the events: mid-grey where there are none, brighter or darker by the polarities' sum."""
+    picture = np.zeros(width * height, np.int64)
+    np.add.at(picture, recording.pixels(width), recording.polarity)
+    return (128 + np.clip(32 * picture, -128, 127)).astype(np.uint8).reshape(height, width)

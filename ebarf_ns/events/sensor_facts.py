@@ -13,7 +13,8 @@ import numpy as np
 from numba import njit
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.pairs import PairIndex, index_pairs, missed_after
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import PairIndex, missed_after
 from ebarf_ns.events.recording import Recording, RecordingFile
 from ebarf_ns.events.timing import clock_step_us, doubles, flicker_hz
 

@@ -9,23 +9,20 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numba import njit
 
-from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.recording import Recording, joined, write_recording
-from ebarf_ns.formats.source import Piece, Source
+from ebarf_ns.formats.event_checks import MAX_TIME_US, check_order, check_polarity, check_values, late, unwrapped
+from ebarf_ns.formats.source import Source
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64
 
-_MAX_TIME_US = 1 << 61
-# Counters of 31 and 32 bits begin anew; before and after that they are this near to their ends.
-_WRAPS_US, _NEAR_US = (1 << 31, 1 << 32), 1_000_000
 _RUN = np.dtype([("t_us", "<i8"), ("x", "<u2"), ("y", "<u2"), ("polarity", "i1")])
 _MERGED_AT_ONCE, _SAMPLE_EVERY = 1 << 20, 1 << 10
 
@@ -48,6 +45,9 @@ class Intake:
     """Mirror columns, for events whose x counts from the right; frames and calibration stay as they are."""
     flip_y: bool = False
     """Mirror rows, for events whose y counts from below; frames and calibration stay as they are."""
+    crop: tuple[int, int, int, int] | None = None
+    """Keep the pixels from column X0 and row Y0 up to, but without, column X1 and row Y1; after mirroring. Camera and
+    its frames are cropped with them."""
     time_offset_us: int = 0
     """Added to every time."""
     start_us: int | None = None
@@ -149,13 +149,13 @@ def _checked(
     width, height = sensor_size
     turned_us, before_us, lowest, highest = 0, None, 1, 0
     for piece in source.pieces:
-        _check_values(source, piece, width, height)
+        check_values(source, piece, width, height)
         lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
-        _check_polarity(source, piece, lowest, highest)
+        check_polarity(source, piece, lowest, highest)
         t_us = piece.t_us + turned_us if turned_us else piece.t_us
-        if _late(t_us, before_us).any():
-            t_us, turned_us = _unwrapped(t_us.copy(), before_us, turned_us, report)
-            _check_order(source.path, piece, t_us, before_us, intake, report)
+        if late(t_us, before_us).any():
+            t_us, turned_us = unwrapped(t_us.copy(), before_us, turned_us, report.repaired)
+            check_order(source.path, piece, t_us, before_us, intake.unsorted, report.repaired)
         before_us = int(t_us[-1]) if before_us is None else max(before_us, int(t_us.max()))
         report.read += len(piece)
         progress(report.read)
@@ -168,102 +168,11 @@ def _checked(
         yield _windowed(Recording(x, y, t_us, polarity), intake, report)
 
 
-def _late(t_us: Int64[np.ndarray, "events"], before_us: int | None) -> Bool[np.ndarray, "events"]:
-    """Which events are earlier than the one before."""
-    late = np.empty(len(t_us), bool)
-    late[0] = before_us is not None and t_us[0] < before_us
-    np.less(t_us[1:], t_us[:-1], out=late[1:])
-    return late
-
-
-def _check_values(source: Source, piece: Piece, width: int, height: int) -> None:
-    x, y, t_us = piece.x, piece.y, piece.t_us
-    wide, high = int(x.max()), int(y.max())
-    # One look at the extremes, and only where they are wrong a look at each.
-    if wide < width and high < height and int(x.min()) >= 0 and int(y.min()) >= 0 and _plausible(t_us):
-        return
-    swapped = _read_as(source)
-    if wide < height and high < width:
-        other = source.columns.translate(str.maketrans("xy", "yx"))
-        swapped = f"; x reaches {wide} and y {high}: are they swapped?"
-        swapped += f" --event-columns '{' '.join(other)}' says so" if other else ""
-    for name, column, wrong, expected in (
-        ("x", x, (x < 0) | (x >= width), f"0 to {width - 1}, the sensor width{swapped}"),
-        ("y", y, (y < 0) | (y >= height), f"0 to {height - 1}, the sensor height{swapped}"),
-        ("t", t_us, (t_us > _MAX_TIME_US) | (t_us < -_MAX_TIME_US), f"microseconds within ±{_MAX_TIME_US}"),
-    ):
-        if wrong.any():
-            k = int(wrong.argmax())
-            raise RecordingError(
-                f"{source.path}: {name} of {piece.place(k)} is {column[k]}, expected {expected} "
-                f"({np.count_nonzero(wrong):,} such of the {len(piece):,} events around it)"
-            )
-
-
-def _read_as(source: Source) -> str:
-    """Of columns without names, how they were read, and what says otherwise."""
-    return (
-        f"; columns are read as '{' '.join(source.columns)}', --event-columns says otherwise" if source.columns else ""
-    )
-
-
-def _plausible(t_us: np.ndarray) -> bool:
-    return -_MAX_TIME_US <= int(t_us.min()) and int(t_us.max()) <= _MAX_TIME_US
-
-
-def _check_polarity(source: Source, piece: Piece, lowest: int, highest: int) -> None:
-    """Either 0 and 1 or -1 and 1, in the whole file."""
-    signed = lowest < 0
-    p = piece.polarity
-    wrong = (p != -1) & (p != 1) if signed else (p != 0) & (p != 1)
-    if lowest < -1 or highest > 1 or (signed and wrong.any()):
-        k = int(wrong.argmax()) if wrong.any() else 0
-        raise RecordingError(
-            f"{source.path}: polarity of {piece.place(k)} is {p[k]}, expected 0 (darker) and 1 (brighter), or -1 and "
-            f"1, throughout; the file has {lowest} to {highest}{_read_as(source)}"
-        )
-
-
-def _unwrapped(
-    t_us: Int64[np.ndarray, "events"], before_us: int | None, turned_us: int, report: IntakeReport
-) -> tuple[Int64[np.ndarray, "events"], int]:
-    """Times that run on where a counter of 31 or 32 bits began anew, which leaves no doubt at such values."""
-    for k in np.flatnonzero(_late(t_us, before_us)).tolist():
-        before = int(t_us[k - 1]) if k else before_us
-        assert before is not None
-        for wrap_us in _WRAPS_US:
-            # A signed counter goes on at minus its range.
-            lowest = -wrap_us if wrap_us == 1 << 31 and t_us[k] - turned_us < 0 else 0
-            counted = before - turned_us
-            if 0 <= wrap_us - counted < _NEAR_US and 0 <= int(t_us[k]) - turned_us - lowest < _NEAR_US:
-                t_us[k:] += wrap_us - lowest
-                turned_us += wrap_us - lowest
-                report.repaired[f"times after the counter of {wrap_us.bit_length() - 1} bits began anew"] += 1
-                break
-    return t_us, turned_us
-
-
-def _check_order(
-    path: Path, piece: Piece, t_us: np.ndarray, before_us: int | None, intake: Intake, report: IntakeReport
-) -> None:
-    late = _late(t_us, before_us)
-    if not late.any():
-        return
-    k = int(late.argmax())
-    if intake.unsorted == "refuse":
-        before = int(t_us[k - 1]) if k else before_us
-        raise RecordingError(
-            f"{path}: {piece.place(k)} is at {t_us[k]} us, after one at {before} us; expected events in order of time "
-            f"({np.count_nonzero(late):,} such of the {len(piece):,} around it), or --unsorted sort to sort them"
-        )
-    report.repaired["events were earlier than the one before, and are sorted"] += int(np.count_nonzero(late))
-
-
 def _windowed(events: Recording, intake: Intake, report: IntakeReport) -> Recording:
     if intake.start_us is None and intake.end_us is None:
         return events
-    start_us = -_MAX_TIME_US if intake.start_us is None else intake.start_us
-    end_us = _MAX_TIME_US if intake.end_us is None else intake.end_us
+    start_us = -MAX_TIME_US if intake.start_us is None else intake.start_us
+    end_us = MAX_TIME_US if intake.end_us is None else intake.end_us
     inside = (events.t_us >= start_us) & (events.t_us <= end_us)
     report.left_out["events outside the time window"] += int(len(events) - np.count_nonzero(inside))
     return events.select(inside)
@@ -304,7 +213,7 @@ def _filtered(
 ) -> Iterator[Recording]:
     """Without duplicates, hot pixels and events too soon, as far as asked for; pieces without events are left out."""
     width, height = sensor_size
-    last_us = np.full(width * height, -_MAX_TIME_US)
+    last_us = np.full(width * height, -MAX_TIME_US)
     last_polarity = np.zeros(width * height, np.int8)
     of_hot = f"events of {np.count_nonzero(hot)} hot pixels" if hot is not None else ""
     for piece in pieces:
@@ -318,8 +227,18 @@ def _filtered(
             report.left_out["events twice over"] += int(np.count_nonzero(why == 1))
             report.left_out["events within the refractory time"] += int(np.count_nonzero(why == 2))
             piece = piece.select(why == 0)  # noqa: PLW2901
+        if intake.crop:
+            piece = _cropped(piece, intake.crop, report)  # noqa: PLW2901
         if len(piece):
             yield piece
+
+
+def _cropped(events: Recording, crop: tuple[int, int, int, int], report: IntakeReport) -> Recording:
+    left, top, right, bottom = crop
+    inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+    report.left_out["events outside the crop"] += int(len(events) - np.count_nonzero(inside))
+    kept = events.select(inside)
+    return replace(kept, x=kept.x - np.uint16(left), y=kept.y - np.uint16(top))
 
 
 @njit(cache=True)

@@ -261,7 +261,7 @@ def _listed(path: Path, unit: Literal["s", "us"]) -> list[tuple[int, Path]]:
     images = []
     lines = _lines(path) if path.is_file() else []
     for number, line in enumerate(lines, start=1):
-        fields = line.split()
+        fields = line.strip().split(maxsplit=1)
         if not fields or line.startswith("#"):
             continue
         try:

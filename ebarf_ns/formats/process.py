@@ -16,24 +16,24 @@ import cv2
 import numpy as np
 import torch
 
-from ebarf_ns.errors import RecordingError, SceneError, TrajectoryError
+from ebarf_ns.errors import SceneError, TrajectoryError, did_you_mean
 from ebarf_ns.evaluation.compare import read_beside_reference
-from ebarf_ns.files import whole_folder
+from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
+from ebarf_ns.files import read_picture, whole_folder, write_picture
 from ebarf_ns.formats.calibration import read_calibration
 from ebarf_ns.formats.intake import Intake, hot_pixels, take_in
 from ebarf_ns.formats.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.formats.recognise import RecordingFormat, open_recording, recognised, recognised_folder
-from ebarf_ns.formats.source import DECIMALS, Source, TimeUnit
+from ebarf_ns.formats.source import Source, TimeUnit
+from ebarf_ns.formats.trajectory_beside_events import apart, clipped, doubts
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
-from ebarf_ns.geometry.cameras import Camera
+from ebarf_ns.geometry.cameras import Camera, Crop, cropped
 from ebarf_ns.geometry.so3 import rotate
-from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
+from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.geometry.trajectory_file import write_tum
 from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
-# A trajectory this much longer than its recording, with no two poses among the events, is in another unit of time.
-_LONGEST_SPAN_RATIO = 100
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 Format = Literal[
     "auto",
@@ -52,7 +52,6 @@ Format = Literal[
     "mat",
     "text",
 ]
-_FEW_KEYFRAMES, _SHORT_SHARE, _MUCH_LONGER = 4, 0.5, 500
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def _check(settings: ProcessSettings) -> None:
 @contextmanager
 def _unpacked(source: Path) -> Iterator[Path]:
     """The source, or what is in it where it is a zip file of a dataset."""
-    if source.suffix != ".zip":
+    if source.suffix != ".zip" or not source.exists():
         yield source
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -139,7 +138,7 @@ def _unpacked(source: Path) -> Iterator[Path]:
 
 def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
     if not source.exists():
-        raise SceneError(f"{source}: no such file or folder, expected a recording")
+        raise SceneError(f"{source}: no such file or folder, expected a recording{did_you_mean(source)}")
     layout = _layout(format, source)
     if layout:
         if not source.is_dir():
@@ -204,6 +203,15 @@ def _assemble(
     source = ingredients.open_events()
     camera, notes = _camera(ingredients, settings, source.sensor_size), list(ingredients.notes)
     size, intake = (camera.width, camera.height), settings.events
+    whole = camera
+    if intake.crop:
+        left, top, right, bottom = intake.crop
+        if not (0 <= left < right <= camera.width and 0 <= top < bottom <= camera.height):
+            raise SceneError(
+                f"--crop is {left} {top} {right} {bottom}, expected X0 Y0 X1 Y1 with 0 <= X0 < X1 <= {camera.width} "
+                f"and 0 <= Y0 < Y1 <= {camera.height}"
+            )
+        camera = cropped(camera, intake.crop)
     hot = hot_pixels(source, size, intake, intake.hot_pixels) if intake.hot_pixels is not None else None
     source = ingredients.open_events() if hot is not None else source
     report = take_in(source, size, intake, folder / "events.h5", hot, progress)
@@ -221,15 +229,15 @@ def _assemble(
         notes += said
     if initial is None:
         raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
-    notes += _doubts(source, span_us, initial, intake.time_offset_us)
+    notes += doubts(source, span_us, initial, intake.time_offset_us)
     # Who cut out a window, or said the events' unit, is told, not stopped.
     meant = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
-    notes += _apart(initial, span_us, settings.trajectory or source.path, meant)
-    initial = _clipped(initial, span_us, settings.trajectory or source.path)
+    notes += apart(initial, span_us, settings.trajectory or source.path, meant)
+    initial = clipped(initial, span_us, settings.trajectory or source.path)
     notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
     write_tum(folder / "trajectory.txt", initial)
     if groundtruth is not None:
-        groundtruth = _clipped(groundtruth, span_us, settings.groundtruth or source.path)
+        groundtruth = clipped(groundtruth, span_us, settings.groundtruth or source.path)
         write_tum(folder / "groundtruth.txt", groundtruth)
     threshold = ContrastThreshold(*settings.contrast_threshold) if settings.contrast_threshold else None
     frames, seen, within, left_out = [], 0, 0, ingredients.frames_left_out
@@ -237,7 +245,7 @@ def _assemble(
         frame = replace(frame, t_us=frame.t_us + intake.time_offset_us)  # noqa: PLW2901
         if span_us[0] <= frame.t_us <= span_us[1]:
             within += 1
-            taken = _taken_along(frame, f"{seen:06d}", camera, folder)
+            taken = _taken_along(frame, f"{seen:06d}", whole, intake.crop, folder)
             if isinstance(taken, Frame):
                 frames.append(taken)
             else:
@@ -255,6 +263,8 @@ def _assemble(
         bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
     )
     write_scene(scene)
+    contradicted = polarity_contradicted(polarity_correlations(scene))
+    notes += [f"suspicious: {contradicted}"] if contradicted else []
     taken_along = "" if len(frames) == within else f", {len(frames)} of which are taken along"
     notes.append(
         f"{len(initial.t_us)} keyframes around the events, {within} of {seen} frames within their span{taken_along}"
@@ -267,7 +277,10 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
     if settings.camera and camera is None:
         camera = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said).camera
     if camera is None:
-        raise SceneError("no calibration with the recording, expected --camera with a file that has one")
+        raise SceneError(
+            "no calibration with the recording, expected --camera with a file that has one: of kalibr, ROS, OpenCV, "
+            "EuRoC, VINS, ORB-SLAM, DV, basalt, a scene.json, or a line of fx fy cx cy and distortion"
+        )
     if said is not None and said != (camera.width, camera.height):
         raise SceneError(
             f"the recording says its sensor has {said[0]} x {said[1]} pixels, the calibration {camera.width} x "
@@ -283,66 +296,6 @@ def _initial(
     if groundtruth is None:
         return read_trajectory(path, known, span_us)
     return read_beside_reference(path, groundtruth, known, span_us)
-
-
-def _doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, offset_us: int) -> list[str]:
-    """What looks wrong of times in a guessed unit, beside the trajectory; an error where another unit looks right."""
-    unit = source.guessed_unit
-    if unit is None or _beside(span_us, trajectory):
-        return []
-    units: tuple[TimeUnit, ...] = ("s", "ms", "us", "ns")
-    others = []
-    for other in units:
-        factor = 10.0 ** (DECIMALS[other] - DECIMALS[unit])
-        scaled = tuple(round((t_us - offset_us) * factor) + offset_us for t_us in span_us)
-        if other != unit and _beside(scaled, trajectory):
-            others.append(f"{other} ({(scaled[1] - scaled[0]) * 1e-6:.3f} s)")
-    seconds, of_poses = (span_us[1] - span_us[0]) * 1e-6, int(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6
-    doubt = f"events over {seconds:.6f} s, if their times are in {unit}, beside a trajectory over {of_poses:.3f} s"
-    if others:
-        raise RecordingError(
-            f"{source.path}: {doubt}; expected --event-time-unit with {' or '.join(others)}, or {unit} if it is right, "
-            "or another --pose-time-unit"
-        )
-    return [f"suspicious: {doubt}; --event-time-unit says another unit"]
-
-
-def _beside(span_us: tuple[int, ...], trajectory: Trajectory) -> bool:
-    """Whether events and trajectory overlap, and neither is many hundred times as long as the other, nor the events
-    shorter than the time between keyframes."""
-    first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
-    if min(span_us[1], last_us) <= max(span_us[0], first_us):
-        return False
-    length_us = span_us[1] - span_us[0]
-    alike = last_us - first_us < _MUCH_LONGER * length_us and length_us < _MUCH_LONGER * (last_us - first_us)
-    short = length_us < _SHORT_SHARE * float(trajectory.t_us.diff().double().median())
-    return alike and not (short and len(trajectory.t_us) >= _FEW_KEYFRAMES)
-
-
-def _clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:
-    """The poses within the events' span, and one more at either end."""
-    first, last = torch.searchsorted(trajectory.t_us, torch.tensor(span_us)).tolist()
-    chosen = slice(max(first - 1, 0), last + 1)
-    clipped = Trajectory(trajectory.t_us[chosen], Poses(*(column[chosen] for column in trajectory.poses)))
-    if len(clipped.t_us) < 2:
-        raise TrajectoryError(
-            f"{path}: poses from {trajectory.t_us[0]} to {trajectory.t_us[-1]} us, but events from {span_us[0]} to "
-            f"{span_us[1]} us; expected at least 2 poses around the events, on the same clock"
-        )
-    return clipped
-
-
-def _apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, meant: bool) -> list[str]:
-    """What is odd where all events lie between two poses; raises :class:`TrajectoryError` where nothing explains it."""
-    t_us, events_s = trajectory.t_us, (span_us[1] - span_us[0]) * 1e-6
-    among = int(within_span(t_us, torch.tensor(span_us)).sum())
-    poses_s = float(t_us[-1] - t_us[0]) * 1e-6
-    if among >= 2 or not bool(within_span(torch.tensor(span_us), t_us).any()):
-        return []
-    said = f"{path}: the {len(t_us)} poses span {poses_s:g} s, with {among} of them among the events, which span "
-    if poses_s > _LONGEST_SPAN_RATIO * events_s and not meant:
-        raise TrajectoryError(f"{said}{events_s:g} s; expected one unit of time: --event-time-unit or --pose-time-unit")
-    return [f"{said}{events_s:g} s: times in another unit? (--event-time-unit, --pose-time-unit)"]
 
 
 def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -361,23 +314,30 @@ def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tupl
     return tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
 
 
-def _taken_along(frame: FrameFile, name: str, camera: Camera, folder: Path) -> Frame | str:
-    """A copy: PNG where the scene can hold it as it is; of what size a frame is that its camera cannot have taken."""
+def _taken_along(frame: FrameFile, name: str, camera: Camera, crop: Crop | None, folder: Path) -> Frame | str:
+    """A copy: PNG where the scene can hold it as it is; of what size a frame is that its camera cannot have taken.
+
+    Frames of the event camera itself are cropped with it.
+    """
+    crop = crop if frame.camera is None else None
     picture = frame.picture
     name = picture.stem if isinstance(picture, Path) else name
-    as_it_is = isinstance(picture, Path) and picture.suffix.lower() == ".png"
-    flag = cv2.IMREAD_UNCHANGED if as_it_is else cv2.IMREAD_GRAYSCALE
-    image = cv2.imread(str(picture), flag) if isinstance(picture, Path) else picture
+    is_png = isinstance(picture, Path) and picture.suffix.lower() == ".png"
+    flag = cv2.IMREAD_UNCHANGED if is_png else cv2.IMREAD_GRAYSCALE
+    image = read_picture(picture, flag) if isinstance(picture, Path) else picture
     if image is None:
         raise SceneError(f"{picture}: cannot be read as an image, expected one, or --no-frames")
     size, of = image.shape[1::-1], frame.camera or camera
     if size != (of.width, of.height):
         return f"{size[0]} x {size[1]} pixels, expected their camera's {of.width} x {of.height}"
+    if crop:
+        of = cropped(of, crop)
+        image = image[crop[1] : crop[3], crop[0] : crop[2]]
     path = folder / "frames" / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
-    if as_it_is:
+    if is_png and crop is None:
         path.write_bytes(Path(picture).read_bytes())  # pyright: ignore[reportArgumentType]
     else:
-        cv2.imwrite(str(path), image)
+        write_picture(path, image)
     extrinsic = tuple(map(tuple, np.asarray(frame.event_camera_from_frame_camera, float).tolist()))
     return Frame(path, frame.t_us, of, extrinsic, frame.intensity)

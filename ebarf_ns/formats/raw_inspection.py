@@ -4,15 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import whole_file, write_picture
 from ebarf_ns.formats.intake import far_busier
 from ebarf_ns.formats.source import Piece, Source
+from ebarf_ns.printing import print_facts
 
 _LARGEST_SENSOR = 8192
 _SLOT_US = 100_000
@@ -153,17 +151,15 @@ def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output
     framed = np.pad(grey, ((0, 0), (2, 2), (2, 2)), constant_values=255)
     rows = [np.hstack(list(framed[k : k + columns])) for k in range(0, _PICTURES, columns)]
     with whole_file(output) as temporary:
-        cv2.imwrite(str(temporary), np.vstack(rows))
+        write_picture(temporary, np.vstack(rows))
 
 
 def print_raw_summary(summary: RawSummary, path: Path) -> None:
-    """For a person."""
-    console = Console()
-    table = Table(title=str(path), show_header=False, title_justify="left")
+    """For a person: first what looks wrong."""
     seconds = (summary.end_us - summary.start_us) * 1e-6
     size = f"{summary.width} x {summary.height}"
     most = max(1, *summary.rate)
-    for name, value in (
+    facts = [
         ("format", summary.format),
         ("sensor", size if summary.sensor_size_said else f"{size} at least, by its events; the file does not say"),
         ("events", f"{summary.events:,} over {seconds:.3f} s, {summary.events_per_second:,.0f} a second"),
@@ -172,10 +168,5 @@ def print_raw_summary(summary: RawSummary, path: Path) -> None:
         ("time", f"{summary.start_us:,} to {summary.end_us:,} us"),
         ("polarity", f"{summary.brighter_share:.1%} brighter, {1 - summary.brighter_share:.1%} darker"),
         ("busiest pixels", ", ".join(f"({x}, {y}) {count:,}" for x, y, count in summary.hottest_pixels)),
-    ):
-        table.add_row(name, value)
-    console.print(table)
-    for suspicion in summary.suspicions:
-        console.print(f"[yellow]![/yellow] {suspicion}")
-    if not summary.suspicions:
-        console.print("[green]nothing suspicious[/green]")
+    ]
+    print_facts(path, summary.suspicions, facts)

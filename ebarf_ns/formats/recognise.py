@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, get_args
 
-from ebarf_ns.errors import RecordingError
+from ebarf_ns.errors import RecordingError, did_you_mean
 from ebarf_ns.formats.columns import parsed_order
 from ebarf_ns.formats.readers.text import read_text
 from ebarf_ns.formats.source import Source, TimeUnit
@@ -87,7 +87,7 @@ def recognised(path: Path) -> RecordingFormat:
         with path.open("rb") as file:
             beginning = file.read(_BEGINNING)
     except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror or error}") from None
+        raise RecordingError(f"{path}: {error.strerror or error}{did_you_mean(path)}") from None
     for magic, found in _MAGIC.items():
         if beginning.startswith(magic):
             return found

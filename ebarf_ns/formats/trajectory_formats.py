@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.errors import TrajectoryError, did_you_mean
 from ebarf_ns.files import opened_npz
 from ebarf_ns.formats.raw_poses import (
     NOTHING_KNOWN,
@@ -173,7 +173,8 @@ def read_raw(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> RawPoses:
             return _colmap(path, _colmap_binary(path), known)
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError, ValueError, EOFError, struct.error, KeyError) as error:
-        raise TrajectoryError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+        reason = getattr(error, "strerror", None) or error
+        raise TrajectoryError(f"{path}: cannot be read ({reason}){did_you_mean(path)}") from None
     if path.name == "images.txt":
         return _colmap(path, _colmap_text(path, lines), known)
     return read_text(path, lines, known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 CameraModel = Literal["pinhole", "radtan", "equidistant"]
+Crop = tuple[int, int, int, int]
+"""First column and row, and those after the last."""
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 
 
@@ -66,6 +68,12 @@ class Camera:
     @property
     def _centre(self) -> Float[Tensor, "2"]:
         return torch.tensor([self.cx, self.cy], dtype=torch.float64)
+
+
+def cropped(camera: Camera, crop: Crop) -> Camera:
+    """The camera that has those pixels alone."""
+    left, top, right, bottom = crop
+    return replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
 
 
 def distort_radtan(plane: Float[Tensor, "*batch 2"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch 2"]:

@@ -48,7 +48,9 @@ def _smooth(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "keyfr
     # Of very many, every so-manieth tells; the best stiffness grows with the fifth root of their number.
     every = -(-len(t) // _MOST)
     stiffness = _stiffness(t[::every], unit[::every]) * every**0.2
-    return make_smoothing_spline(t, unit, lam=stiffness)(t) * spread + columns[0]
+    # Column by column: before SciPy 1.16 it takes one at a time.
+    smooth = [make_smoothing_spline(t, column, lam=stiffness)(t) for column in unit.T]
+    return np.stack(smooth, axis=1) * spread + columns[0]
 
 
 def _stiffness(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "keyframes dim"]) -> float:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.errors import TrajectoryError, did_you_mean
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes
 
@@ -21,7 +21,8 @@ def read_tum(path: Path) -> Trajectory:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error})") from None
+        reason = getattr(error, "strerror", None) or error
+        raise TrajectoryError(f"{path}: cannot be read as text ({reason}){did_you_mean(path)}") from None
     times_us: list[int] = []
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=1):

@@ -17,7 +17,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from torch import nn
 
 if TYPE_CHECKING:
-    from ebarf_ns.radiance.hash_grid import HashGridShape
+    from ebarf_ns.radiance.lattice import HashGridShape
 
 
 def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.Parameter]]:

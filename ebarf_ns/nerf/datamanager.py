@@ -1,77 +1,42 @@
 """Event pairs to camera-frame rays: what nerfstudio calls the data manager."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
-import cv2
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Int64
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
-from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
-from ebarf_ns.errors import EbarfError, RecordingError, one_line_errors
-from ebarf_ns.events.pairs import (
-    DrawAhead,
-    EventPairs,
-    HeldoutBlocks,
-    PairIndex,
-    accumulate,
-    batch_random,
-    index_pairs,
-    joined,
-)
+from ebarf_ns.errors import RecordingError, one_line_errors
+from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import EventPairs, PairIndex, joined
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import SensorFacts, identify
 from ebarf_ns.events.timing import clock_step_us, flicker_hz
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
+from ebarf_ns.nerf.views import EventDataset, SpiralStart
 from ebarf_ns.scene import Scene, check_clocks
 
 _HELDOUT_SEED = 1 << 32
 _LONGEST_HELDOUT_PAIR = 30
 _MOST_FLICKER = 0.5
-
-
-class EventDataset(InputDataset):
-    """Cameras with a picture each: the frame taken there, or else the events around that keyframe."""
-
-    def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0):
-        super().__init__(dataparser_outputs, scale_factor)
-        self.scene: Scene = self.metadata["scene"]
-
-    def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """8-bit grey in three channels, for people to look at; evaluation reads the frames themselves."""
-        path = self._dataparser_outputs.image_filenames[image_idx]
-        grey = self._read_frame(path) if path.is_file() else self._events_around(image_idx)
-        size = (int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx]))
-        return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)[:, :, None].repeat(3, axis=2)
-
-    def _read_frame(self, path: Any) -> np.ndarray:
-        from ebarf_ns.evaluation.frames import read_frame
-
-        frame = next(frame for frame in self.scene.frames if frame.path == path)
-        linear = read_frame(frame)
-        return (np.clip(linear / max(linear.max(), 1e-9), 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
-
-    def _events_around(self, image_idx: int) -> np.ndarray:
-        camera = self.scene.camera
-        assert self.cameras.metadata is not None
-        times = self.cameras.metadata["camera_t_us"][:, 0]
-        half_us = int(times.diff().median()) // 2 if len(times) > 1 else 10_000
-        t_us = int(times[image_idx])
-        try:
-            file = RecordingFile(self.scene.events, camera.width, camera.height)
-            return accumulate(file.window(t_us - half_us, t_us + half_us), camera.width, camera.height)
-        except EbarfError:
-            # A trained run can be looked at when its recording is gone.
-            return np.full((camera.height, camera.width), 128, np.uint8)
+_VIEWS_SEED = 2 << 32
+_BY_CLOCK = (
+    "span_us", "index", "_training_index", "_training_batches", "facts", "heldout_pairs", "heldout_blocks",
+    "hot_pixels_left_out", "_believed_refractory_us",
+)  # fmt: skip
 
 
 @dataclass
@@ -107,7 +72,10 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):
-    """Hands out rays in the camera's own frame, with their times; poses live in the model."""
+    """Hands out rays in the camera's own frame, with their times; poses live in the model.
+
+    What reads the recording is a cached property: nerfstudio's viewer looks at every other attribute there is.
+    """
 
     config: EventDataManagerConfig
     train_dataset: EventDataset
@@ -134,7 +102,13 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     def setup_eval(self) -> None:
         """The loaders of full views that nerfstudio's scripts ask for."""
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
-        self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
+        self.eval_dataloader = SpiralStart(self.eval_dataset, device=self.device)
+
+    def show_from(self, refined: Callable[[Cameras], Cameras]) -> None:
+        """Take the cameras of all views for the refined ones, for whoever asks this data manager."""
+        for dataset in (self.train_dataset, self.eval_dataset):
+            dataset.show_from(refined(dataset.cameras))
+        self.setup_eval()
 
     @cached_property
     def rank(self) -> int:
@@ -145,7 +119,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         """Take the trajectory's times for off by ``offset_us``: other events have poses then."""
         if offset_us != self.clock_offset_us:
             self.clock_offset_us = offset_us
-            for name in ("span_us", "index", "_training_index", "_training_batches", "facts", "heldout_pairs"):
+            for name in _BY_CLOCK:
                 self.__dict__.pop(name, None)
 
     @cached_property
@@ -159,7 +133,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         first_us, last_us = (int(t_us) + self.clock_offset_us for t_us in trajectory.t_us[[0, -1]])
         return max(start_us, first_us), min(end_us, last_us)
 
-    @property
+    @cached_property
     def _recording(self) -> RecordingFile:
         scene: Scene = self.train_dataset.scene
         return RecordingFile(scene.events, scene.camera.width, scene.camera.height)
@@ -183,12 +157,12 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         CONSOLE.print(f"left out {flicker.pixels.sum():,} pixels that follow a lamp of {flicker.hz:.1f} Hz")
         return index.without(flicker.pixels)
 
-    @property
+    @cached_property
     def hot_pixels_left_out(self) -> int:
         """Number of pixels that are not trained on for being far busier than usual."""
         return self.index.hot_pixels if self.config.leave_out_hot_pixels else 0
 
-    @property
+    @cached_property
     def heldout_blocks(self) -> HeldoutBlocks:
         """The stretches of time whose events no training sees."""
         return HeldoutBlocks(*self.span_us, self.config.heldout_share)
@@ -238,7 +212,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             parts.append(self._training_index.draw_blank(4 * blank, width, self.span_us, random).select(slice(blank)))
         return joined(parts)
 
-    @property
+    @cached_property
     def _believed_refractory_us(self) -> float:
         stated = self.train_dataset.scene.refractory_us
         return self.facts.refractory_us.value if stated is None else stated
@@ -258,11 +232,12 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return camera.bearings(camera.pixel_grid()).float().flatten(0, 1).to(self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
-        """Rays of batch number ``step``; scripts that keep asking for step 0 get one batch after another."""
+        """Rays of batch number ``step``; of whole views, and ever others, for scripts that open a finished run."""
         self.train_count += 1
-        batch = step if self.test_mode == "val" else self.train_count
+        if self.test_mode != "val":
+            return self.view_rays(self.get_train_rays_per_batch(), self.train_count), {}
         with one_line_errors():
-            return self._rays(self._training_batches.batch(batch * self.world_size + self.rank))
+            return self._rays(self._training_batches.batch(step * self.world_size + self.rank))
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
         """Rays of the held-out pairs, the same for every step, method and seed."""
@@ -279,21 +254,32 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         assert self.train_pixel_sampler is not None
         return self.train_pixel_sampler.num_rays_per_batch
 
+    def view_rays(self, count: int, number: int) -> RayBundle:
+        """Rays of any pixels at any times within the trajectory; what there are events of does not matter."""
+        scene, random = self.train_dataset.scene, batch_random(_VIEWS_SEED, number)
+        trajectory: Trajectory = self.train_dataset.metadata["trajectory"]
+        first_us, last_us = (int(t_us) + self.clock_offset_us for t_us in trajectory.t_us[[0, -1]])
+        pixel = random.integers(scene.camera.width * scene.camera.height, size=count)
+        t_us = random.integers(first_us, last_us, size=count, endpoint=True)
+        return self.rays_at(torch.from_numpy(pixel), torch.from_numpy(t_us))
+
+    def rays_at(self, pixel: Int64[Tensor, "rays"], t_us: Int64[Tensor, "rays"]) -> RayBundle:
+        """Rays of pixels, given by their row-major numbers, in the camera's frame, for the model to place in time."""
+        pixel = pixel.to(self.device)
+        directions = self.bearings[pixel]
+        return RayBundle(
+            origins=torch.zeros_like(directions),
+            directions=directions,
+            pixel_area=torch.ones_like(directions[:, :1]),
+            camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
+            metadata={"event_t_us": t_us.to(self.device)[:, None], "event_pixel": pixel[:, None]},
+        )
+
     def _rays(self, pairs: EventPairs) -> tuple[RayBundle, dict[str, torch.Tensor]]:
         def tensor(column: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(column).to(self.device)
 
         pixel = torch.cat([tensor(pairs.pixel_before), tensor(pairs.pixel)]).long()
-        directions = self.bearings[pixel]
-        bundle = RayBundle(
-            origins=torch.zeros_like(directions),
-            directions=directions,
-            pixel_area=torch.ones_like(directions[:, :1]),
-            camera_indices=torch.zeros_like(directions[:, :1], dtype=torch.long),
-            metadata={
-                "event_t_us": torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)])[:, None],
-                "event_pixel": pixel[:, None],
-            },
-        )
+        bundle = self.rays_at(pixel, torch.cat([tensor(pairs.t0_us), tensor(pairs.t1_us)]))
         columns = ("polarity_sum", "event_count", "variance", "silent")
         return bundle, {name: tensor(getattr(pairs, name)) for name in columns}

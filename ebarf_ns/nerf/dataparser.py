@@ -76,6 +76,7 @@ class EbarfDataParser(DataParser):
         super().__init__(config)
         with one_line_errors():
             self.scene = read_scene(_scene_folder(config))
+            _say_what_is_missing(self.scene)
             self.trajectory = read_tum(self.scene.trajectory)
             _check_scene_is_the_runs(self.scene, self.trajectory, config.kept)
             self.normalization = _normalization(self.scene, self.trajectory)
@@ -150,6 +151,15 @@ def _scene_folder(config: EbarfDataParserConfig) -> Path:
     return config.kept
 
 
+def _say_what_is_missing(scene: Scene) -> None:
+    """Frames show how good a training is, and it goes on without them."""
+    if scene.missing:
+        sys.stderr.write(
+            f"warning: {scene.missing[0]}: no such file; {len(scene.missing)} of the validation frames' files are "
+            f"missing, and {len(scene.frames)} frames are left to compare renders with\n"
+        )
+
+
 def _check_scene_is_the_runs(scene: Scene, trajectory: Trajectory, kept: Path | None) -> None:
     """Another scene may have come to the place of the one that a run was trained on."""
     if kept is None or not (kept / "trajectory.txt").is_file():
@@ -208,6 +218,18 @@ def frame_cameras(frames: list[Frame], event_camera: Trajectory, mount_scale: fl
     return _nerfstudio_cameras(
         [frame.camera for frame in frames], event_camera.t_us, torch.cat([rotation, position], dim=-1)
     )
+
+
+def replace_intrinsics(cameras: Cameras, given: Camera, learned: Camera) -> None:
+    """Give those of the cameras that are the event camera, by its intrinsics as given, the intrinsics learned."""
+    one = Trajectory(torch.zeros(1, dtype=torch.int64), Poses(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])))
+    before, after = (_nerfstudio_cameras([camera], one.t_us, one.poses.matrix()) for camera in (given, learned))
+    columns = ("fx", "fy", "cx", "cy", "width", "height")
+    same = torch.cat([getattr(cameras, name) == getattr(before, name) for name in columns], dim=-1).all(dim=-1)
+    for name in ("fx", "fy", "cx", "cy", "distortion_params"):
+        column, new = getattr(cameras, name), getattr(after, name)
+        if column is not None and new is not None:
+            setattr(cameras, name, torch.where(same[:, None], new.to(column), column))
 
 
 def _nerfstudio_cameras(

@@ -13,6 +13,7 @@ from ebarf_ns.nerf.optimizers import BudgetDecayConfig, FusedAdamConfig, Keyfram
 from ebarf_ns.nerf.pipeline import EbarfPipelineConfig
 from ebarf_ns.nerf.trainer import EbarfTrainerConfig
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizerConfig
+from ebarf_ns.nerf.viewer_panel import ViewedPipeline
 
 
 def _trainer(
@@ -35,7 +36,7 @@ def _trainer(
         steps_per_save=1000,
         mixed_precision=False,
         averaged_steps=averaged_steps,
-        pipeline=EbarfPipelineConfig(datamanager=datamanager, model=model),
+        pipeline=EbarfPipelineConfig(_target=ViewedPipeline, datamanager=datamanager, model=model),
         optimizers={
             "fields": {
                 "optimizer": FusedAdamConfig(lr=field_rate, eps=1e-15),

@@ -1,7 +1,7 @@
 """The picture of the method: event pair, two poses, two rays, two intensities, one difference, one loss."""
 
 from dataclasses import dataclass, field
-from math import sqrt
+from math import log, sqrt
 from typing import Annotated, Any, Literal, TypeVar
 
 import torch
@@ -13,15 +13,17 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 
-from ebarf_ns.errors import TrainingError
+from ebarf_ns.errors import TrainingError, one_line_errors
 from ebarf_ns.geometry.so3 import rotate
 from ebarf_ns.nerf.intrinsics import Intrinsics
+from ebarf_ns.nerf.old_flags import old_names
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
 from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
 from ebarf_ns.photometry.sensor_response import SensorResponse, thresholds_of_ratio
 from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
-from ebarf_ns.radiance.hash_grid import HashGridShape
+from ebarf_ns.radiance.lattice import HashGridShape
+from ebarf_ns.radiance.normals import SurfaceNormals
 from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
 from ebarf_ns.scene import Scene
@@ -52,7 +54,7 @@ class EbarfModelConfig(ModelConfig):
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
     loss: Literal["threshold", "normalized"] = "threshold"
     """Eq. 5, with thresholds taken as equal where the scene does not give them; or the paper's Eq. 6."""
-    huber_delta: Annotated[float | None, tyro.conf.arg(aliases=["--pipeline.model.outliers-from"])] = 0.3
+    huber_delta: Annotated[float | None, tyro.conf.arg(aliases=old_names("--pipeline.model.huber-delta"))] = 0.3
     """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
     render_variance: float = 5.0
     """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
@@ -105,6 +107,17 @@ class EbarfModelConfig(ModelConfig):
     """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
     precision: Precision | None = None
     """Of the MLPs' products; None: as planned."""
+    exposure: float = 0.0
+    """Of the output rgb: brighter by so many stops."""
+    gamma: float = 1.0
+    """Of the output rgb: more than 1 lifts the shadows."""
+
+    def __getattr__(self, name: str) -> Any:
+        # All that ns-export marching-cubes does before its traceback is to look for this.
+        if name == "sdf_field":
+            with one_line_errors():
+                raise TrainingError("ns-export marching-cubes is for signed distance fields; expected ns-export tsdf")
+        raise AttributeError(name)
 
 
 class EbarfModel(Model):
@@ -165,7 +178,10 @@ class EbarfModel(Model):
         )
         self.intrinsics = Intrinsics(scene.camera) if config.learn_intrinsics else None
         self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
+        """Log brightness that is shown as black and as white."""
         self.display_range: Tensor
+        self.exposure, self.gamma = config.exposure, config.gamma
+        self.normals: SurfaceNormals | None = None
         self.random = torch.Generator()
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
@@ -191,8 +207,8 @@ class EbarfModel(Model):
         self.sensor.begin_step(step)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, and what the
-        sensor is taken to be."""
+        """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, what the sensor
+        is taken to be, and of a finished run the surfaces' normals, in nerfstudio's [0, 1]."""
         if self.intrinsics and "event_pixel" in (ray_bundle.metadata or {}):
             ray_bundle.directions = self.intrinsics.bearings(ray_bundle.metadata.pop("event_pixel")[:, 0])
         self._look_back(ray_bundle)
@@ -200,18 +216,16 @@ class EbarfModel(Model):
         rays = Rays(ray_bundle.origins, ray_bundle.directions)
         rendered = self.renderer(rays, self.random if self.training else None)
         brightness = log_brightness(rendered.intensity, self.config.brightness)
-        if self.training:
-            self._follow_display_range(brightness.detach())
-        low, high = self.display_range
-        grey = ((brightness.detach() - low) / (high - low)).clamp(0, 1)
+        normals = {"normals": (self.normals(rays, rendered.depth) + 1) / 2} if self.normals else {}
         return {
-            "rgb": grey[:, None].expand(-1, 3),
+            "rgb": self.grey(brightness.detach())[:, None].expand(-1, 3),
             "intensity": rendered.intensity[:, None],
             "brightness": brightness[:, None],
             "depth": rendered.depth[:, None],
             "accumulation": rendered.accumulation[:, None],
             # Training in several processes asks that what is learned takes part in this.
             "sensor": self.sensor(),
+            **normals,
         }
 
     def _look_back(self, ray_bundle: RayBundle) -> None:
@@ -260,10 +274,20 @@ class EbarfModel(Model):
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
-    def _follow_display_range(self, brightness: Float[Tensor, "rays"]) -> None:
-        low, high = torch.quantile(brightness, torch.tensor([0.02, 0.98], device=brightness.device))
+    def grey(self, brightness: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels"]:
+        """Log brightness for people, in [0, 1]."""
+        low, high = self.display_range
+        return ((brightness + log(2) * self.exposure - low) / (high - low)).clamp(0, 1) ** (1 / self.gamma)
+
+    def fit_display_range(self, brightness: Float[Tensor, "rays"]) -> None:
+        """Show log brightness as whole views have it: all but a thousandth at either end."""
+        low, high = torch.quantile(brightness.float(), brightness.new_tensor([0.001, 0.999]))
         seen = torch.stack([low, torch.maximum(high, low + 0.1)])
-        self.display_range.lerp_(seen.where(seen.isfinite().all(), self.display_range), 0.05)
+        self.display_range.copy_(seen.where(seen.isfinite().all(), self.display_range))
+
+    def show_normals(self) -> None:
+        """Render normals from now on, of the field as it is now."""
+        self.normals = SurfaceNormals(self.renderer)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Grey with the true accumulation as alpha, so that exported point clouds leave empty space empty."""

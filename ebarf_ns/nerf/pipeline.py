@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -16,18 +15,21 @@ from ebarf_ns.errors import EvaluationError, one_line_errors
 from ebarf_ns.evaluation.frames import depth_error, fit_brightness, image_errors, read_depth, read_frame
 from ebarf_ns.evaluation.heldout import prediction
 from ebarf_ns.evaluation.trajectory_error import reference_in_estimates_world, trajectory_results
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import whole_file, write_picture
+from ebarf_ns.geometry.so3 import turn_between
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
-from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.nerf.checkpoints import unsealed
 from ebarf_ns.nerf.datamanager import EventDataManager
-from ebarf_ns.nerf.dataparser import Normalization, frame_cameras
+from ebarf_ns.nerf.dataparser import Normalization, frame_cameras, replace_intrinsics
 from ebarf_ns.nerf.model import EbarfModel
 from ebarf_ns.scene import Frame, Scene
 
 # nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
 warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True to a scalar")
+
+_DISPLAY_RAYS = 8192
 
 
 @dataclass
@@ -48,6 +50,8 @@ class EbarfPipeline(VanillaPipeline):
             super().__init__(*args, **kwargs)
             if self.test_mode == "val":
                 self._check_references()
+        self.last_loss: Tensor | None = None
+        """Of the last training step's event pairs."""
         self.register_buffer("cost", torch.zeros(2, dtype=torch.float64))
         self.cost: Tensor
 
@@ -79,7 +83,9 @@ class EbarfPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
         self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.rank)
-        return super().get_train_loss_dict(step)
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self.last_loss = losses["event_loss"].detach()
+        return outputs, losses, metrics
 
     def trajectory(self, refined: bool = True) -> Trajectory:
         """The keyframes, refined or as they came, in the input's world frame and scale."""
@@ -88,6 +94,33 @@ class EbarfPipeline(VanillaPipeline):
         world = self._normalization.invert(keyframes)
         return Trajectory(world.t_us.cpu(), world.poses)
 
+    def write_refined(self, path: Path) -> None:
+        """Write the refined trajectory in TUM format; comments say what was done to its times."""
+        comments, given, refined = [], self.trajectory(refined=False), self.trajectory()
+        if inserted := len(refined.t_us) - len(given.t_us):
+            comments.append(f"inserted keyframes: {inserted}")
+        if added_us := int(refined.t_us[0] - given.t_us[0]):
+            comments.append(f"clock of the events: {added_us:+} us were added to the times given")
+        write_tum(path, refined, comments)
+
+    @torch.no_grad()
+    def numbers(self) -> dict[str, Any]:
+        """What can be said of a training at any time: held-out events, corrections, and errors against a reference."""
+        training = self.model.training
+        self.model.eval()
+        results = {**self._heldout(), **self._corrections(), **self._trajectory_errors()[0]}
+        self.model.train(training)
+        return results
+
+    @torch.no_grad()
+    def _corrections(self) -> dict[str, float]:
+        """Root mean squares over the keyframes of how far training has moved them, positions in the input's unit."""
+        optimizer = self.model.camera_optimizer
+        given, refined = optimizer.initial(), optimizer.keyframes()
+        moved = (refined.position - given.position).square().sum(dim=-1).mean().sqrt() / self._normalization.scale
+        turned_rad = turn_between(given.quat_wxyz, refined.quat_wxyz).square().sum(dim=-1).mean().sqrt()
+        return {"corrected_position": float(moved), "corrected_rotation_deg": float(turned_rad.rad2deg())}
+
     @torch.no_grad()
     def evaluate(self, renders: Path | None = None) -> dict[str, Any]:
         """Held-out event loss and, where the scene has references, image, depth and trajectory errors.
@@ -95,8 +128,10 @@ class EbarfPipeline(VanillaPipeline):
         With ``renders``, each frame is written there beside its reference as a PNG.
         """
         self.eval()
+        self.fit_display_range()
         trajectory_errors, scale = self._trajectory_errors()
-        results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors, **self._keyframes()}
+        results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors}
+        results |= {**self._corrections(), **self._keyframes()}
         self.train()
         # JSON knows no NaN.
         return {name: None if value != value else value for name, value in results.items()}
@@ -106,6 +141,27 @@ class EbarfPipeline(VanillaPipeline):
         with one_line_errors():
             super().load_pipeline(unsealed(loaded_state, f"step-{step:09d}.ckpt"), step)
             self.datamanager.shift_clock(int(self.model.camera_optimizer.clock_offset_us))
+        if self.test_mode != "val":
+            self.datamanager.show_from(self._refined)
+            self.model.show_normals()
+            self.fit_display_range()
+
+    def _refined(self, cameras: Cameras) -> Cameras:
+        """Cameras where training has put them, which nothing moves again: they have no time."""
+        refined = cameras[...]
+        refined.camera_to_worlds = self.model.camera_optimizer.apply_to_camera(cameras).detach()
+        refined.metadata = {}
+        if self.model.intrinsics:
+            replace_intrinsics(refined, self.scene.camera, self.model.intrinsics.refined())
+        return refined
+
+    @torch.no_grad()
+    def fit_display_range(self) -> None:
+        """Let pictures for people show what there is in whole views."""
+        training = self.model.training
+        self.model.eval()
+        self.model.fit_display_range(self.model(self.datamanager.view_rays(_DISPLAY_RAYS, 0))["brightness"][:, 0])
+        self.model.train(training)
 
     def _heldout(self) -> dict[str, float | None]:
         """How well held-out events are predicted, and the contrast thresholds by which they would be best."""
@@ -115,7 +171,7 @@ class EbarfPipeline(VanillaPipeline):
         before, after = self.model(rays)["brightness"][:, 0].double().cpu().chunk(2)
         names = ("polarity_sum", "event_count", "variance")
         total, count, variance = (batch[name].double().cpu().numpy() for name in names)
-        predicted = prediction((after - before).numpy(), total, count, variance, self._threshold_ratio)
+        predicted = prediction((after - before).numpy(), total, count, variance, self._threshold_ratio())
         return {
             "heldout_event_loss": predicted.unexplained,
             "implied_threshold_on": predicted.threshold_on,
@@ -136,7 +192,6 @@ class EbarfPipeline(VanillaPipeline):
             "clock_deviation_ms": rest.deviation_us * 1e-3,
         }
 
-    @property
     def _threshold_ratio(self) -> float:
         """C_on / C_off as stated, or as counted in the recording: the same for every method and setting."""
         stated = self.scene.contrast_threshold
@@ -203,7 +258,7 @@ class EbarfPipeline(VanillaPipeline):
             for k, (fitted, reference) in enumerate(pairs):
                 beside = np.clip(np.concatenate([fitted, reference], axis=1) / white, 0, 1) ** (1 / 2.2)
                 with whole_file(renders / f"{k:04d}.png") as temporary:
-                    cv2.imwrite(str(temporary), (beside * 255).round().astype(np.uint8))
+                    write_picture(temporary, (beside * 255).round().astype(np.uint8))
         depths = []
         unit = (scale_to_reference or 1.0) / self._normalization.scale
         for frame, output in zip(frames, outputs, strict=True):

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from ebarf_ns.errors import TrainingError
+from ebarf_ns.nerf.old_flags import warn_of_old_flags
 
 if TYPE_CHECKING:
     from nerfstudio.configs.base_config import MachineConfig
-
-    from ebarf_ns.nerf.trainer import EbarfTrainerConfig
+    from nerfstudio.engine.trainer import TrainerConfig
 
 _ABOVE_0 = ("max_num_iterations", "max_train_seconds")
 _LEAST = {
@@ -54,8 +55,10 @@ _LEAST = {
 }
 
 
-def check_settings(config: EbarfTrainerConfig) -> None:
+def check_settings(config: TrainerConfig) -> None:
     """Raise :class:`TrainingError` that names the flag, its value and what was expected."""
+    warn_of_old_flags(sys.argv)
+    _check_scene_is_named(config)
     for flag in _ABOVE_0:
         value = getattr(config, flag)
         if value is not None and not value > 0:
@@ -71,6 +74,12 @@ def check_settings(config: EbarfTrainerConfig) -> None:
             f"--pipeline.datamanager.silent-share is {silent}, expected 0 with --pipeline.model.loss normalized: "
             "Eq. 6 has no unit for what silence allows"
         )
+
+
+def _check_scene_is_named(config: TrainerConfig) -> None:
+    datamanager: Any = config.pipeline.datamanager
+    if datamanager.data is None and datamanager.dataparser.data == type(datamanager.dataparser).data:
+        raise TrainingError("no --data given, expected ns-train ebarf --data SCENE")
 
 
 def check_machine(machine: MachineConfig) -> None:

@@ -37,6 +37,7 @@ from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.run_folder import take_folder
 from ebarf_ns.nerf.settings_check import check_machine, check_settings
 from ebarf_ns.nerf.support import Support, support
+from ebarf_ns.nerf.warm_up import compile_kernels
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
 from ebarf_ns.scene import Scene, check_bounds, read_scene, write_camera
@@ -96,6 +97,7 @@ class EbarfTrainer(Trainer):
             try:
                 self._plan()
                 super().setup(test_mode)
+                self.compile_seconds = compile_kernels(self.pipeline)
                 self._align()
                 if self.progress() >= 1:
                     raise TrainingError(
@@ -382,6 +384,7 @@ class EbarfTrainer(Trainer):
             "method": self.config.method_name,
             "device": device,
             "threads": torch.get_num_threads(),
+            "compile_seconds": round(self.compile_seconds, 1),
             "seed": self.config.machine.seed,
             "scene": str(scene.folder.resolve()),
             "scene_digest": scene_digest(scene),

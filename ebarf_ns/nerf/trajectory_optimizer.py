@@ -85,6 +85,8 @@ class TrajectoryOptimizer(CameraOptimizer):
     ):
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras, device)
         self.config = config
+        self.frozen = False
+        """Whether the keyframes stay where they are until further notice."""
         self.pixel_rad = 1 / focal_px
         kind, gap_us = config.interpolation or "linear", config.longest_gap_us or 0
         start, _ = densified(config.start(keyframes), gap_us, kind)
@@ -136,7 +138,7 @@ class TrajectoryOptimizer(CameraOptimizer):
         if self.config.mode == "refine":
             every = self.config.every ** (1 if step < _SETTLED_STEP else 2)
             for one in (self.correction, self.clock_px):
-                one.requires_grad_(step % every == 0)
+                one.requires_grad_(step % every == 0 and not self.frozen)
 
     def begin_from(self, start: Poses) -> None:
         """Correct these keyframes from now on."""
@@ -266,6 +268,8 @@ class TrajectoryOptimizer(CameraOptimizer):
     def forward(self, indices: Int[Tensor, "cameras"]) -> Float[Tensor, "cameras 3 4"]:
         """From refined to initial camera frame of keyframes, in nerfstudio's axes, to be multiplied on the right."""
         flip = torch.tensor([1.0, -1.0, -1.0], device=self.keyframe_t_us.device)
+        # An empty list has no integers in it, and the viewer asks for none.
+        indices = indices.long()
         initial, refined = (
             Poses(p.position[self.given[indices]], p.quat_wxyz[self.given[indices]])
             for p in (self.initial(), self.keyframes())

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import interpolate
 
-from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape
+from ebarf_ns.radiance.hash_grid import HashGrid
+from ebarf_ns.radiance.lattice import HashGridShape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -26,8 +27,10 @@ _MAX_LOG_DENSITY = 12.0
 def fastest_precision(device: torch.device | str) -> Precision:
     """bfloat16 where the processor multiplies it natively, else float32."""
     if torch.device(device).type == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported() else "float32"
-    able = torch.cpu.get_capabilities()
+        # Before torch 2.5, the second question is an error where the answer to the first one is no.
+        return "bfloat16" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "float32"
+    # Before torch 2.11 there is nobody to ask.
+    able = getattr(torch.cpu, "get_capabilities", dict)()
     return "bfloat16" if able.get("avx512_bf16") or able.get("amx_bf16") else "float32"
 
 

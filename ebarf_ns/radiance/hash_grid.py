@@ -7,7 +7,7 @@ The lattice and the table's order are tiny-cuda-nn's, so that a trained table me
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Literal
@@ -16,68 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ebarf_ns.radiance.lattice import PRIMES, HashGridShape, Lattice
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 Carrier = Literal["numba", "triton", "tcnn", "torch"]
-PRIMES = (1, 2654435761, 805459861)
-
-
-@dataclass(frozen=True)
-class HashGridShape:
-    """Levels of geometrically growing resolution; a level that fits ``table_size`` is stored densely, else hashed."""
-
-    levels: int = 8
-    features: int = 4
-    coarsest: int = 8
-    finest: int = 192
-    table_size_log2: int = 17
-
-    @property
-    def growth(self) -> float:
-        """Ratio of neighbouring resolutions; a hair less than asked, so that rounding cannot add a vertex."""
-        return ((self.finest - 0.1) / self.coarsest) ** (1 / max(self.levels - 1, 1))
-
-    @property
-    def scales(self) -> list[float]:
-        """Cells of each level between its first and last vertex."""
-        return [self.coarsest * self.growth**level - 1 for level in range(self.levels)]
-
-    @property
-    def resolutions(self) -> list[int]:
-        """Vertices per side of each level."""
-        return [int(np.ceil(scale)) + 1 for scale in self.scales]
-
-    @property
-    def rows(self) -> list[int]:
-        """Table rows of each level, a multiple of 8."""
-        return [min(-(-(resolution**3) // 8) * 8, 1 << self.table_size_log2) for resolution in self.resolutions]
-
-    @property
-    def width(self) -> int:
-        """Number of features over all levels."""
-        return self.levels * self.features
-
-    @property
-    def reach(self) -> float:
-        """Share of tiny-cuda-nn's cube in which every cell has both its vertices: [0, 1] is mapped to [0, reach]."""
-        return (self.coarsest - 1.5) / (self.coarsest - 1)
-
-
-class Lattice(nn.Module):
-    """What the kernels need to know of the levels, as tensors that move with the module."""
-
-    def __init__(self, shape: HashGridShape):
-        super().__init__()
-        self.register_buffer("stretch", torch.tensor(shape.scales).float() * shape.reach, persistent=False)
-        self.register_buffer("resolution", torch.tensor(shape.resolutions), persistent=False)
-        self.register_buffer("first_row", torch.tensor([0, *np.cumsum(shape.rows)]), persistent=False)
-        self.stretch: Tensor
-        """Cells of each level across the unit cube, float32 of the levels."""
-        self.resolution: Tensor
-        """Vertices per side, int64 of the levels."""
-        self.first_row: Tensor
-        """Where each level begins in the table, int64 of the levels and one more."""
 
 
 class HashGrid(nn.Module):
@@ -125,21 +69,34 @@ def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
     if point.dtype == torch.float32 and point.device.type == "cpu":
         return "numba"
     if point.dtype == torch.float32 and point.is_cuda:
-        return "tcnn" if _importable("tinycudann") else "triton" if _importable("triton") else "torch"
+        if not why_not("tinycudann"):
+            return "tcnn"
+        if not why_not("triton"):
+            return "triton"
+        _say_slow()
     return "torch"
 
 
 @lru_cache
-def _importable(name: str) -> bool:
-    """Whether it is there and fits this machine: tiny-cuda-nn raises errors of its own on GPUs it was not built for,
-    and Triton's driver is compiled when it is first asked."""
+def why_not(name: str) -> str:
+    """Why a library is not made use of, empty where it is: tiny-cuda-nn raises errors of its own on GPUs it was not
+    built for, and Triton's driver is compiled when it is first asked."""
     try:
         module = import_module(name)
         if name == "triton":
             module.runtime.driver.active.get_current_device()
-    except Exception:
-        return False
-    return True
+    except Exception as error:
+        return " ".join(str(error).split()) or type(error).__name__
+    return ""
+
+
+@lru_cache
+def _say_slow() -> None:
+    """Once: whoever waits should know what for."""
+    sys.stderr.write(
+        "the hash grid runs in plain torch on this GPU, about 200 times slower, for want of Triton "
+        f"({why_not('triton'):.120}) and tiny-cuda-nn ({why_not('tinycudann'):.120})\n"
+    )
 
 
 _encodings: dict[HashGridShape, nn.Module] = {}

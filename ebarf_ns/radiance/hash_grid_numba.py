@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from jaxtyping import Float
 
-    from ebarf_ns.radiance.hash_grid import Lattice
+    from ebarf_ns.radiance.lattice import Lattice
 
 # All of fastmath but the promise that there are no infinities and nothing that is not a number.
 _FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}

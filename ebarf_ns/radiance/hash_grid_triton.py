@@ -8,8 +8,7 @@ machines without a GPU test them.
 # Triton's language is not Python to a type checker.
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 
-from __future__ import annotations
-
+# No postponed annotations: Triton 3.0's interpreter looks for tl.constexpr itself.
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,14 +19,14 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from ebarf_ns.radiance.hash_grid import Lattice
+    from ebarf_ns.radiance.lattice import Lattice
 
 _BLOCK = 128  # points a program
 
 
 def encode(
-    point: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], lattice: Lattice
-) -> Float[Tensor, "points width"]:
+    point: "Float[Tensor, 'points 3']", table: "Float[Tensor, 'rows features']", lattice: "Lattice"
+) -> "Float[Tensor, 'points width']":
     """Features of float32 points on a GPU, differentiable in points and table."""
     levels = (lattice.stretch, lattice.resolution, lattice.first_row)
     encoded: Tensor = _Encoding.apply(point, table, *levels)  # pyright: ignore[reportAssignmentType]

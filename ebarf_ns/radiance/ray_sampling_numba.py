@@ -110,5 +110,7 @@ def _place(
                 upper = near + (i + 1) * step if half_side == 1 else lower * ratio
             share = (wanted - weights[i]) / max(weights[i + 1] - weights[i], np.float32(1e-12))
             first[j] = lower + min(max(share, np.float32(0)), np.float32(1)) * (upper - lower)
+        # One by one: to assign a row brings a check of its shape, whose message takes seconds to compile.
         for k in range(1, sharing):
-            edges[group + k * groups] = first
+            for j in range(samples + 1):
+                edges[group + k * groups, j] = first[j]

@@ -5,12 +5,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from ebarf_ns.errors import SimulationError
 from ebarf_ns.events.recording import write_recording
-from ebarf_ns.files import whole_folder
+from ebarf_ns.files import whole_folder, write_picture
 from ebarf_ns.geometry.cameras import COEFFICIENTS, Camera, CameraModel
 from ebarf_ns.geometry.trajectory_file import write_tum
 from ebarf_ns.scene import ContrastThreshold, Frame, Scene, read_scene, write_scene
@@ -179,4 +178,4 @@ def _write_frames(view: View, settings: Simulation, end_us: int, folder: Path) -
 def _write_grey(path: Path, radiance: np.ndarray, camera: Camera) -> None:
     path.parent.mkdir(exist_ok=True)
     grey = np.clip(radiance / _WHITE * 65535, 0, 65535).round().astype(np.uint16)
-    cv2.imwrite(str(path), grey.reshape(camera.height, camera.width))
+    write_picture(path, grey.reshape(camera.height, camera.width))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ebarf_ns.benchmarks.engine import Figure, table
+from ebarf_ns.benchmarks.figures import Figure, table
 from ebarf_ns.benchmarks.settings import PARTS
 from tests.conftest import run_command
 

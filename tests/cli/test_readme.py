@@ -1,4 +1,4 @@
-"""Every command of the README is run, with less time to train."""
+"""Every command of the README and of the pages that it points to is run, with less time to train."""
 
 import json
 import re
@@ -16,7 +16,14 @@ from tests.conftest import REPOSITORY, TINY_TRAINING, run_ok
 from tests.formats import writers
 
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", README, re.S)]
+DOCS = {page.name: page.read_text(encoding="utf-8") for page in (REPOSITORY / "docs").glob("*.md")}
+
+
+def blocks(text: str) -> list[list[str]]:
+    return [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", text, re.S)]
+
+
+BLOCKS = blocks(README)
 
 
 def test_make_demo_goes_from_nothing_to_a_report(tmp_path: Path):
@@ -43,7 +50,7 @@ def test_the_first_block_is_the_two_commands_of_the_makefile():
 
 
 def test_the_real_recording_block_runs(slider_depth: Path, tmp_path: Path):
-    (block,) = [block for block in BLOCKS if any("slider_depth" in line for line in block)]
+    (block,) = [block for block in blocks(DOCS["benchmarks.md"]) if any("slider_depth" in line for line in block)]
     shutil.copytree(slider_depth, tmp_path / "slider_depth")
     for line in block:
         words = shlex.split(line.replace("--max-train-seconds 60", "--max-train-seconds 5"))
@@ -74,8 +81,29 @@ def test_the_block_of_an_own_recording_runs(tiny_scene: Path, tmp_path: Path):
     assert (made.t_us == events.t_us).all() and (made.polarity == events.polarity).all()
 
 
-def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
-    (content,) = re.findall(r"```json\n(.*?)```", README, re.S)
+def test_a_run_is_looked_at_as_the_readme_says(trained_run: Path, tmp_path: Path):
+    (block,) = [block for block in BLOCKS if any("evaluate RUN" in line for line in block)]
+    run = tmp_path / "run"
+    shutil.copytree(trained_run, run)
+    for line in block:
+        words = shlex.split(line.replace("RUN", str(run)))
+        if words[0] != "ns-viewer":
+            run_ok(*words, cwd=tmp_path)
+    assert (run / "report" / "report.html").stat().st_size > 500
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= 150
+
+
+def test_links_lead_somewhere():
+    for folder, text in ((REPOSITORY, README), *((REPOSITORY / "docs", page) for page in DOCS.values())):
+        for target in re.findall(r"\]\(([^)#\s]+)", text):
+            assert target.startswith("http") or (folder / target).exists(), target
+
+
+def test_the_scene_of_the_page_of_formats_is_a_scene(tmp_path: Path):
+    (content,) = re.findall(r"```json\n(.*?)```", DOCS["formats.md"], re.S)
     (tmp_path / "scene.json").write_text(content)
     for name in ("events.h5", "trajectory.txt"):
         (tmp_path / name).touch()
@@ -90,6 +118,6 @@ def test_the_table_names_commands_that_exist():
         assert "usage" in run_ok(*words, "--help").lower()
 
 
-def test_its_picture_is_there():
+def test_its_pictures_are_there():
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", README, re.S):
         assert (REPOSITORY / picture).stat().st_size > 10_000

@@ -4,11 +4,9 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +18,7 @@ import torch
 
 from ebarf_ns.evaluation.trajectory_error import trajectory_error
 from ebarf_ns.geometry.trajectory_file import read_tum
-from tests.conftest import TINY_TRAINING, run_command, run_ok
+from tests.conftest import TINY_TRAINING, free_port, run_command, run_ok, wait_for_page
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render needs ffmpeg")
 
@@ -132,10 +130,12 @@ def test_render_dataset(trained_run: Path, tmp_path: Path, split: str):
 def test_export_pointcloud(trained_run: Path, tmp_path: Path):
     run_ok(
         "ns-export", "pointcloud", *config(trained_run), "--output-dir", tmp_path, "--num-points=3000",
-        "--num-rays-per-batch=2048", "--normal-method=open3d", "--save-world-frame=True",
+        "--num-rays-per-batch=2048", "--save-world-frame=True",
     )  # fmt: skip
-    points = np.asarray(o3d.io.read_point_cloud(tmp_path / "point_cloud.ply").points)
-    assert len(points) > 2000
+    cloud = o3d.io.read_point_cloud(tmp_path / "point_cloud.ply")
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    assert len(points) > 2000 and np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
+    assert normals.std(axis=0).min() > 0.1
     # In the world frame, the cloud lies within the scene's bounds and is not all in one place.
     assert (points > -2.3).all() and (points < 2.3).all() and points.std(axis=0).min() > 0.05
 
@@ -170,6 +170,52 @@ def test_export_cameras_are_the_refined_keyframes(trained_run: Path, tmp_path: P
     assert torch.allclose(world, refined, atol=1e-4) and not torch.allclose(world, initial, atol=1e-3)
 
 
+def test_export_marching_cubes_says_what_it_is_for(trained_run: Path, tmp_path: Path):
+    finished = run_command("ns-export", "marching-cubes", *config(trained_run), "--output-dir", tmp_path)
+    assert finished.code == 2 and "Traceback" not in finished.errors + finished.output
+    assert "error: ns-export marching-cubes is for signed distance fields" in finished.errors
+
+
+@needs_ffmpeg
+@pytest.mark.slow
+def test_every_command_shows_the_same_moment_from_the_same_place(trained_run: Path, tmp_path: Path):
+    run, images = config(trained_run), ["--image-format=png"]
+    run_ok(
+        "ns-render", "dataset", *run, "--output-path", tmp_path / "dataset", "--split=test", *images,
+        "--rendered-output-names", "rgb",
+    )  # fmt: skip
+    run_ok(
+        "ns-render", "interpolate", *run, "--output-path", tmp_path / "interpolate", "--interpolation-steps=2",
+        "--output-format=images", *images,
+    )  # fmt: skip
+    # So small that it is the view that it begins with.
+    run_ok(
+        "ns-render", "spiral", *run, "--output-path", tmp_path / "spiral", "--output-format=images", *images,
+        "--seconds=0.2", "--frame-rate=10", "--radius=1e-6",
+    )  # fmt: skip
+    run_ok("ns-export", "cameras", *run, "--output-dir", tmp_path)
+    (pose,) = [json.loads((tmp_path / "transforms_eval.json").read_text())[0]["transform"]]
+    (tmp_path / "path.json").write_text(json.dumps(path_of_one_view(trained_run, pose)))
+    run_ok(
+        "ns-render", "camera-path", *run, "--camera-path-filename", tmp_path / "path.json", "--output-path",
+        tmp_path / "path", "--output-format=images", *images,
+    )  # fmt: skip
+    first = {kind: sorted((tmp_path / kind).rglob("*.png"))[0] for kind in ("dataset", "interpolate", "spiral", "path")}
+    shown = {kind: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(int) for kind, path in first.items()}
+    assert shown["dataset"].std() > 20
+    for kind in ("interpolate", "spiral", "path"):
+        assert np.abs(shown[kind] - shown["dataset"]).max() <= 3, kind
+
+
+def path_of_one_view(run: Path, pose: list[list[float]]) -> dict:
+    """The event camera at a pose of ``ns-export cameras``, as a path that the viewer could have written."""
+    camera = json.loads((run / "scene" / "scene.json").read_text())["camera"]
+    fov = float(np.rad2deg(2 * np.arctan(camera["height"] / 2 / camera["fy"])))
+    view = {"camera_to_world": [*sum(pose, []), 0, 0, 0, 1], "fov": fov, "aspect": camera["width"] / camera["height"]}
+    size = {"render_height": camera["height"], "render_width": camera["width"]}
+    return {"camera_type": "perspective", **size, "fps": 4, "seconds": 0.25, "camera_path": [view, view]}
+
+
 @pytest.fixture
 def without_recording(trained_run: Path, tiny_scene: Path, tmp_path: Path) -> Iterator[Path]:
     """The trained run, as long as its recording is away."""
@@ -184,10 +230,7 @@ def test_a_run_outlives_its_recording(without_recording: Path, tmp_path: Path):
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert results["heldout_event_loss"] is None and results["psnr"] > 5
     run_ok("ns-export", "cameras", *run, "--output-dir", tmp_path / "cameras")
-    finished = run_command(
-        "ns-export", "pointcloud", *run, "--output-dir", tmp_path / "cloud", "--normal-method=open3d"
-    )
-    assert finished.code == 2 and "no such file, expected the recording" in finished.errors
+    run_ok("ns-export", "pointcloud", *run, "--output-dir", tmp_path / "cloud", "--num-points=3000")
 
 
 @pytest.fixture
@@ -251,21 +294,3 @@ def test_viewer_serves_its_page(trained_run: Path):
     finally:
         process.kill()
         process.wait()
-
-
-def wait_for_page(address: str, process: subprocess.Popen, patience_s: float = 120) -> str:
-    end = time.monotonic() + patience_s
-    while time.monotonic() < end:
-        assert process.poll() is None, process.stdout.read().decode() if process.stdout else ""
-        try:
-            with urllib.request.urlopen(address, timeout=5) as answer:
-                return answer.read().decode(errors="replace")
-        except OSError:
-            time.sleep(1)
-    raise AssertionError(f"{address} did not answer in {patience_s} s")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]

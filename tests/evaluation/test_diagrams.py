@@ -2,7 +2,8 @@ import math
 
 import pytest
 
-from ebarf_ns.evaluation.diagrams import error_of, performance_profile, quartiles, seconds_to, tables
+from ebarf_ns.evaluation.comparison_tables import tables
+from ebarf_ns.evaluation.diagrams import error_of, performance_profile, quartiles, seconds_to
 
 
 def record(method: str, seed: int, errors_m: list[float], seconds: float = 20.0) -> dict:

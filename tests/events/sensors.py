@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ebarf_ns.events.pairs import PairIndex, index_pairs
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import PairIndex
 from ebarf_ns.events.recording import Recording
 
 WIDTH, HEIGHT = 48, 30

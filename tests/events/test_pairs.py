@@ -4,17 +4,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events.pairs import (
-    DrawAhead,
-    EventPairs,
-    HeldoutBlocks,
-    PairIndex,
-    accumulate,
-    batch_random,
-    draw_steps,
-    index_pairs,
-)
-from ebarf_ns.events.recording import Recording
+from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
+from ebarf_ns.events.indexing import index_pairs
+from ebarf_ns.events.pairs import EventPairs, PairIndex, draw_steps
+from ebarf_ns.events.recording import Recording, accumulate
 
 WIDTH, HEIGHT = 4, 3
 
@@ -207,6 +200,14 @@ def test_no_room_for_the_file_of_an_index_is_said(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("os.posix_fallocate", full)
     with pytest.raises(RecordingError, match="no room for an index of .*TMPDIR"):
         index_of(recording(0, 300), memory_bytes=16)
+
+
+def test_a_system_that_cannot_reserve_room_has_an_index_on_disk_too(monkeypatch: pytest.MonkeyPatch):
+    events = recording(3, 300)
+    whole = index_of(events)
+    monkeypatch.delattr("os.posix_fallocate", raising=False)
+    on_disk = index_of(events, memory_bytes=16)
+    assert isinstance(on_disk.events, np.memmap) and np.array_equal(whole.events, on_disk.events)
 
 
 def test_edges_that_have_nearly_all_events_count_in_full():

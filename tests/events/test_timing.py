@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from ebarf_ns.events.pairs import index_pairs
+from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.events.recording import Recording, read_recording
 from ebarf_ns.events.timing import clock_step_us, doubles, flicker_hz
 from tests.conftest import DATA

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.events import intake as intake_module
 from ebarf_ns.events.recording import Recording, read_recording
+from ebarf_ns.formats import intake as intake_module
 from ebarf_ns.formats.intake import Intake, IntakeReport, hot_pixels, take_in
 from ebarf_ns.formats.source import Piece, Source, numbered
 from tests.formats import writers
@@ -136,3 +136,15 @@ def test_what_is_flipped_is_said_and_nothing_else_changes(tmp_path: Path):
     assert np.array_equal(flipped.x, 23 - straight.x) and np.array_equal(flipped.y, 17 - straight.y)
     (only_y, report) = taken(tmp_path, events, flip_y=True)
     assert np.array_equal(only_y.x, straight.x) and "flipped, as asked: y" in report.sentences()
+
+
+def test_a_crop_keeps_its_pixels_counted_from_its_corner(tmp_path: Path):
+    events: list[writers.Event] = [(k, k % 24, k % 18, 1) for k in range(500)]
+    whole, _ = taken(tmp_path, events)
+    kept, report = taken(tmp_path, events, crop=(4, 2, 20, 12))
+    inside = (whole.x >= 4) & (whole.x < 20) & (whole.y >= 2) & (whole.y < 12)
+    assert np.array_equal(kept.t_us, whole.t_us[inside])
+    assert np.array_equal(kept.x, whole.x[inside] - 4) and np.array_equal(kept.y, whole.y[inside] - 2)
+    assert report.left_out == {"events outside the crop": int((~inside).sum())}
+    mirrored, _ = taken(tmp_path, events, crop=(0, 0, 24, 10), flip_y=True)
+    assert np.array_equal(mirrored.y, (17 - whole.y)[whole.y >= 8])

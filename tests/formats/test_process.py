@@ -700,3 +700,21 @@ def test_swapped_columns_of_a_real_file_are_caught(tmp_path: Path):
     )  # fmt: skip
     with pytest.raises(RecordingError, match="the sensor height"):
         process("hdf5", swapped, tmp_path / "scene", settings)
+
+
+def test_a_crop_is_of_events_camera_and_its_frames(tmp_path: Path):
+    settings = ProcessSettings(sensor_size=(64, 48), events=Intake(crop=(8, 4, 56, 40)))
+    process("ecd", ecd(tmp_path / "source"), tmp_path / "scene", settings)
+    scene = read_scene(tmp_path / "scene")
+    assert (scene.camera.width, scene.camera.height, scene.camera.cx, scene.camera.cy) == (48, 36, 24.0, 20.0)
+    read_recording(scene.events, 48, 36)
+    assert len(scene.frames) == 2
+    for frame in scene.frames:
+        assert frame.camera == scene.camera and cv2.imread(str(frame.path)).shape[:2] == (36, 48)
+
+
+def test_a_crop_beyond_the_sensor_is_an_error(tmp_path: Path):
+    settings = ProcessSettings(sensor_size=(64, 48), events=Intake(crop=(8, 4, 65, 40)))
+    with pytest.raises(SceneError, match="--crop is 8 4 65 40, expected X0 Y0 X1 Y1 with 0 <= X0 < X1 <= 64"):
+        process("ecd", ecd(tmp_path / "source"), tmp_path / "scene", settings)
+    assert not (tmp_path / "scene").exists()

@@ -21,7 +21,7 @@ from ebarf_ns.geometry.trajectory import (
 def keyframes(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, Poses]:
     random = np.random.default_rng(seed)
     t_us = torch.from_numpy(np.cumsum(random.integers(1, 50_000, count)))
-    quat = Rotation.random(count, rng=np.random.default_rng(seed)).as_quat()[:, [3, 0, 1, 2]]
+    quat = Rotation.random(count, np.random.default_rng(seed)).as_quat()[:, [3, 0, 1, 2]]
     return t_us, Poses(torch.from_numpy(random.standard_normal((count, 3))).to(dtype), torch.from_numpy(quat).to(dtype))
 
 

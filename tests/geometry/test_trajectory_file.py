@@ -31,7 +31,7 @@ def test_times_are_exact_and_quaternions_scalar_last(tmp_path: Path):
 @given(st.lists(st.integers(-(10**15), 10**15), min_size=2, max_size=20, unique=True))
 def test_written_poses_read_back(tmp_path_factory: pytest.TempPathFactory, times: list[int]):
     times.sort()
-    quat = torch.from_numpy(Rotation.random(len(times), rng=np.random.default_rng(0)).as_quat())[:, [3, 0, 1, 2]]
+    quat = torch.from_numpy(Rotation.random(len(times), np.random.default_rng(0)).as_quat())[:, [3, 0, 1, 2]]
     poses = Poses(torch.randn(len(times), 3, dtype=torch.float64), quat)
     path = tmp_path_factory.mktemp("tum") / "poses.txt"
     write_tum(path, Trajectory(torch.tensor(times), poses))

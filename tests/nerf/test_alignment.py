@@ -10,7 +10,8 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.alignment import align
 from ebarf_ns.nerf.support import support
 from ebarf_ns.nerf.trainer import EbarfTrainer
-from ebarf_ns.radiance.hash_grid import HashGrid, HashGridShape
+from ebarf_ns.radiance.hash_grid import HashGrid
+from ebarf_ns.radiance.lattice import HashGridShape
 from ebarf_ns.simulation.simulate import Simulation, simulate
 from ebarf_ns.simulation.trajectory_errors import NO_ERRORS, TrajectoryErrors
 from tests.nerf.test_training import config, trainer

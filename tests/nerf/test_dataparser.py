@@ -52,6 +52,18 @@ def test_a_scene_that_is_gone_is_opened_by_what_the_run_has_kept(
     assert f"{tmp_path / 'gone'}: no such folder" in said and said.count("\n") == 1
 
 
+def test_missing_frames_are_said_and_do_without(tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = shutil.copytree(tiny_scene, tmp_path / "scene")
+    (folder / "frames" / "0001.png").unlink()
+    outputs = EbarfDataParserConfig(data=folder).setup().get_dataparser_outputs(split="val")
+    assert [path.name for path in outputs.image_filenames] == ["0000.png", "0002.png"]
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.startswith("warning: ") and "0001.png: no such file" in said
+    shutil.rmtree(folder / "frames")
+    outputs = EbarfDataParserConfig(data=folder).setup().get_dataparser_outputs(split="val")
+    assert all(path.parent.name == "keyframes" for path in outputs.image_filenames)
+
+
 def test_another_scene_in_the_place_of_a_runs_is_refused(
     tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -13,7 +13,7 @@ COUNT = 6
 
 
 def keyframes() -> Trajectory:
-    quat = torch.from_numpy(Rotation.random(COUNT, rng=np.random.default_rng(0)).as_quat()).float()[:, [3, 0, 1, 2]]
+    quat = torch.from_numpy(Rotation.random(COUNT, np.random.default_rng(0)).as_quat()).float()[:, [3, 0, 1, 2]]
     position = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
     return Trajectory(torch.arange(COUNT) * 50_000, Poses(position, quat))
 

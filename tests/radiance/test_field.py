@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ebarf_ns.radiance.field import BroadBrightness, RadianceField, contract
-from ebarf_ns.radiance.hash_grid import HashGridShape
+from ebarf_ns.radiance.lattice import HashGridShape
 
 SHAPE = HashGridShape(levels=4, features=2, coarsest=4, finest=32, table_size_log2=10)
 

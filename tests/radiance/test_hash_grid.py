@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import nn
 
-from ebarf_ns.radiance.hash_grid import Carrier, HashGrid, HashGridShape, encode_reference, fastest_carrier
+from ebarf_ns.radiance.hash_grid import Carrier, HashGrid, encode_reference, fastest_carrier
+from ebarf_ns.radiance.lattice import HashGridShape
 
 SHAPES = [
     HashGridShape(levels=4, features=2, coarsest=4, finest=64, table_size_log2=10),
@@ -130,17 +131,25 @@ def test_every_cell_within_the_cube_has_both_its_vertices():
     )
 
 
-def test_the_carrier_follows_device_precision_and_what_is_importable(monkeypatch: pytest.MonkeyPatch):
+def test_the_carrier_follows_device_precision_and_what_is_importable(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     on_cuda = SimpleNamespace(dtype=torch.float32, device=torch.device("cuda"), is_cuda=True)
     present = {"triton"}
-    monkeypatch.setattr("ebarf_ns.radiance.hash_grid._importable", lambda name: name in present)
+    monkeypatch.setattr(
+        "ebarf_ns.radiance.hash_grid.why_not", lambda name: "" if name in present else f"no {name} on this machine"
+    )
     assert fastest_carrier(torch.zeros(1, 3)) == "numba"
     assert fastest_carrier(torch.zeros(1, 3).double()) == "torch"
     assert fastest_carrier(on_cuda) == "triton"  # pyright: ignore[reportArgumentType]
     present.add("tinycudann")
     assert fastest_carrier(on_cuda) == "tcnn"  # pyright: ignore[reportArgumentType]
+    assert capsys.readouterr().err == ""
     present.clear()
-    assert fastest_carrier(on_cuda) == "torch"  # pyright: ignore[reportArgumentType]
+    for _ in range(3):
+        assert fastest_carrier(on_cuda) == "torch"  # pyright: ignore[reportArgumentType]
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "200 times slower" in said and "no triton on this machine" in said
 
 
 class StandInEncoding(nn.Module):

@@ -5,7 +5,7 @@ import torch
 
 from ebarf_ns.radiance import ray_sampling_numba
 from ebarf_ns.radiance.field import RadianceField
-from ebarf_ns.radiance.hash_grid import HashGridShape
+from ebarf_ns.radiance.lattice import HashGridShape
 from ebarf_ns.radiance.ray_sampling import (
     DensityGrid,
     Rays,

@@ -7,7 +7,7 @@ import torch
 
 from ebarf_ns.errors import SimulationError
 from ebarf_ns.evaluation.frames import read_frame
-from ebarf_ns.events.pairs import index_pairs
+from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.events.recording import read_recording
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.so3 import quat_wxyz_to_matrix

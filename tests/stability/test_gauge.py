@@ -17,7 +17,7 @@ PSNR_DB = 1e-4
 def wandering(count: int = 30, seed: int = 0) -> Trajectory:
     random = np.random.default_rng(seed)
     position = np.cumsum(random.standard_normal((count, 3)), axis=0)
-    quat = Rotation.random(count, rng=random).as_quat()[:, [3, 0, 1, 2]]
+    quat = Rotation.random(count, random).as_quat()[:, [3, 0, 1, 2]]
     return Trajectory(torch.arange(count) * 10_000, Poses(torch.from_numpy(position), torch.from_numpy(quat)))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ebarf_ns.events.pairs import index_pairs
+from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.events.recording import Recording
 from ebarf_ns.photometry.brightness import LIN_LOG_KNEE, log_brightness
 from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, threshold_loss

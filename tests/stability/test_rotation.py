@@ -38,9 +38,7 @@ AXIS = torch.tensor([0.48, -0.6, 0.64], dtype=F64)
 
 
 def some_quats(count: int, dtype: torch.dtype, seed: int = 0) -> torch.Tensor:
-    return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(seed)).as_quat()[:, [3, 0, 1, 2]]).to(
-        dtype
-    )
+    return torch.from_numpy(Rotation.random(count, np.random.default_rng(seed)).as_quat()[:, [3, 0, 1, 2]]).to(dtype)
 
 
 def angle_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

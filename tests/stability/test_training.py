@@ -411,7 +411,7 @@ def test_an_error_so_large_that_nothing_can_converge_is_reported_as_such(small_s
     scene = tmp_path / "scene"
     shutil.copytree(small_scene, scene)
     given = read_tum(scene / "trajectory.txt")
-    quat = Rotation.random(len(given.t_us), rng=np.random.default_rng(0)).as_quat()[:, [3, 0, 1, 2]]
+    quat = Rotation.random(len(given.t_us), np.random.default_rng(0)).as_quat()[:, [3, 0, 1, 2]]
     write_tum(scene / "trajectory.txt", Trajectory(given.t_us, Poses(given.poses.position, torch.from_numpy(quat))))
     last = trained(scene, tmp_path)
     assert last["rotation_deg"] > LOST_DEG and last["heldout_event_loss"] > NOTHING_LEARNED

@@ -23,7 +23,7 @@ STILL = torch.tensor([[1.0, 0, 0, 0]])
 def keyframes(count: int, dtype: torch.dtype = F64, seed: int = 0) -> tuple[torch.Tensor, Poses]:
     random = np.random.default_rng(seed)
     t_us = torch.from_numpy(np.cumsum(random.integers(1, 50_000, count)))
-    quat = Rotation.random(count, rng=random).as_quat()[:, [3, 0, 1, 2]]
+    quat = Rotation.random(count, random).as_quat()[:, [3, 0, 1, 2]]
     return t_us, Poses(torch.from_numpy(random.standard_normal((count, 3))).to(dtype), torch.from_numpy(quat).to(dtype))
 
 

@@ -306,7 +306,7 @@ def _dat_pieces(path: Path, begin: int, version: int, dropped: Counter[str]) -> 
             if not len(time):
                 return
             # 32 bits of microseconds begin anew after 71 minutes.
-            turns = np.cumsum(np.diff(time, prepend=before) < -(1 << 31))
+            turns = np.cumsum(np.diff(time, prepend=before) < -(1 << 31), dtype=np.int64)
             t_us = time + epoch_us + (turns << 32)
             before, epoch_us = int(time[-1]), epoch_us + (int(turns[-1]) << 32)
             if version == 2:

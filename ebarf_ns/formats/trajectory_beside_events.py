@@ -1,0 +1,75 @@
+"""Whether a trajectory and a recording belong together: units of time, overlap."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from ebarf_ns.errors import RecordingError, TrajectoryError
+from ebarf_ns.formats.source import DECIMALS, Source, TimeUnit
+from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
+
+# A trajectory this much longer than its recording, with no two poses among the events, is in another unit of time.
+_LONGEST_SPAN_RATIO = 100
+_FEW_KEYFRAMES, _SHORT_SHARE, _MUCH_LONGER = 4, 0.5, 500
+
+
+def doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, offset_us: int) -> list[str]:
+    """What looks wrong of times in a guessed unit, beside the trajectory; an error where another unit looks right."""
+    unit = source.guessed_unit
+    if unit is None or _beside(span_us, trajectory):
+        return []
+    units: tuple[TimeUnit, ...] = ("s", "ms", "us", "ns")
+    others = []
+    for other in units:
+        factor = 10.0 ** (DECIMALS[other] - DECIMALS[unit])
+        scaled = tuple(round((t_us - offset_us) * factor) + offset_us for t_us in span_us)
+        if other != unit and _beside(scaled, trajectory):
+            others.append(f"{other} ({(scaled[1] - scaled[0]) * 1e-6:.3f} s)")
+    seconds, of_poses = (span_us[1] - span_us[0]) * 1e-6, int(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6
+    doubt = f"events over {seconds:.6f} s, if their times are in {unit}, beside a trajectory over {of_poses:.3f} s"
+    if others:
+        raise RecordingError(
+            f"{source.path}: {doubt}; expected --event-time-unit with {' or '.join(others)}, or {unit} if it is right, "
+            "or another --pose-time-unit"
+        )
+    return [f"suspicious: {doubt}; --event-time-unit says another unit"]
+
+
+def _beside(span_us: tuple[int, ...], trajectory: Trajectory) -> bool:
+    """Whether events and trajectory overlap, and neither is many hundred times as long as the other, nor the events
+    shorter than the time between keyframes."""
+    first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    if min(span_us[1], last_us) <= max(span_us[0], first_us):
+        return False
+    length_us = span_us[1] - span_us[0]
+    alike = last_us - first_us < _MUCH_LONGER * length_us and length_us < _MUCH_LONGER * (last_us - first_us)
+    short = length_us < _SHORT_SHARE * float(trajectory.t_us.diff().double().median())
+    return alike and not (short and len(trajectory.t_us) >= _FEW_KEYFRAMES)
+
+
+def clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:
+    """The poses within the events' span, and one more at either end."""
+    first, last = torch.searchsorted(trajectory.t_us, torch.tensor(span_us)).tolist()
+    chosen = slice(max(first - 1, 0), last + 1)
+    clipped = Trajectory(trajectory.t_us[chosen], Poses(*(column[chosen] for column in trajectory.poses)))
+    if len(clipped.t_us) < 2:
+        raise TrajectoryError(
+            f"{path}: poses from {trajectory.t_us[0]} to {trajectory.t_us[-1]} us, but events from {span_us[0]} to "
+            f"{span_us[1]} us; expected at least 2 poses around the events, on the same clock"
+        )
+    return clipped
+
+
+def apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, meant: bool) -> list[str]:
+    """What is odd where all events lie between two poses; raises :class:`TrajectoryError` where nothing explains it."""
+    t_us, events_s = trajectory.t_us, (span_us[1] - span_us[0]) * 1e-6
+    among = int(within_span(t_us, torch.tensor(span_us)).sum())
+    poses_s = float(t_us[-1] - t_us[0]) * 1e-6
+    if among >= 2 or not bool(within_span(torch.tensor(span_us), t_us).any()):
+        return []
+    said = f"{path}: the {len(t_us)} poses span {poses_s:g} s, with {among} of them among the events, which span "
+    if poses_s > _LONGEST_SPAN_RATIO * events_s and not meant:
+        raise TrajectoryError(f"{said}{events_s:g} s; expected one unit of time: --event-time-unit or --pose-time-unit")
+    return [f"{said}{events_s:g} s: times in another unit? (--event-time-unit, --pose-time-unit)"]

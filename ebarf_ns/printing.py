@@ -1,0 +1,28 @@
+"""How facts and suspicions are laid out on a terminal."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+
+def print_facts(what: Path, suspicions: Sequence[str], facts: Sequence[tuple[str, str]]) -> Console:
+    """What looks wrong with a file or folder, then facts about it, each with its name; returns where it was printed."""
+    console = Console(highlight=False)
+    console.print(f"[bold]{escape(str(what))}[/bold]", soft_wrap=True)
+    for suspicion in suspicions:
+        print_line(console, suspicion, "[yellow]![/yellow] ")
+    if not suspicions:
+        console.print("[green]nothing suspicious[/green]")
+    table = Table.grid(padding=(0, 2))
+    for name, value in facts:
+        table.add_row(name, escape(value))
+    console.print(table)
+    return console
+
+
+def print_line(console: Console, line: str, mark: str = "") -> None:
+    """One line, broken between words where a person reads it, whole where a program does."""
+    console.print(mark + escape(line), soft_wrap=not console.is_terminal)
