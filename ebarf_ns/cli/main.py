@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
+from ebarf_ns.cli.estimate_command import TrajectoryEstimate
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
 from ebarf_ns.formats.process import Format, ProcessSettings
 from ebarf_ns.formats.source import TimeUnit
@@ -217,6 +218,7 @@ class Trajectory:
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[TrajectoryCompare, tyro.conf.subcommand("compare")]
+        | Annotated[TrajectoryEstimate, tyro.conf.subcommand("estimate")]
         | Annotated[TrajectoryPerturb, tyro.conf.subcommand("perturb")]
     ]
 

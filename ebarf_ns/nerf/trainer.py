@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from time import monotonic
@@ -38,6 +38,7 @@ from ebarf_ns.nerf.run_folder import take_folder
 from ebarf_ns.nerf.settings_check import check_machine, check_settings
 from ebarf_ns.nerf.support import Support, support
 from ebarf_ns.nerf.warm_up import compile_kernels
+from ebarf_ns.odometry.output import complete_scene
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_carrier
 from ebarf_ns.scene import Scene, check_bounds, read_scene, write_camera
@@ -59,6 +60,8 @@ class EbarfTrainerConfig(TrainerConfig):
     """Begin anew in a folder that holds a run."""
     allow_changed_scene: bool = False
     """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
+    estimate_trajectory: bool = True
+    """Where the scene's trajectory is still to come, estimate it from the events first."""
     learn_intrinsics: bool = False
     """Learn focal length, principal point and the camera's distortion coefficients too; the result is written to
     camera_refined.json, as scene.json has it."""
@@ -124,6 +127,8 @@ class EbarfTrainer(Trainer):
         folder = datamanager.data or datamanager.dataparser.data  # pyright: ignore[reportAttributeAccessIssue]
         if datamanager.dataparser.kept and not Path(folder).is_dir():  # pyright: ignore[reportAttributeAccessIssue]
             raise TrainingError(moved(replace(datamanager.dataparser, data=Path(folder))))  # pyright: ignore[reportAttributeAccessIssue]
+        if self.config.estimate_trajectory:
+            complete_scene(Path(folder), partial(CONSOLE.print, soft_wrap=True))
         scene = read_scene(Path(folder))
         trajectory = read_tum(scene.trajectory)
         check_bounds(scene, trajectory)

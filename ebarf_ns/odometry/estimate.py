@@ -20,6 +20,7 @@ from ebarf_ns.odometry.event_images import event_images
 from ebarf_ns.odometry.mapping import Map, halved, mapped
 from ebarf_ns.odometry.pace import Pace, paced
 from ebarf_ns.odometry.rotation import Turned, turned
+from ebarf_ns.odometry.settings import OdometrySettings
 from ebarf_ns.odometry.tracks import Tracks, displacements_px, followed
 from ebarf_ns.odometry.verdict import INLIER_PX, Agreement, Quality, agreement, explained, view_share
 
@@ -34,20 +35,13 @@ _PILOTS, _PILOT_S, _USUAL_PX_S = 8, 0.01, 150.0
 _MEMORY_S, _KEYFRAME_S = (0.005, 0.3), (0.004, 0.1)
 """Shortest and longest time constant of event images, and time between keyframes."""
 _SHORTEST_TRACK, _FEWEST_TRACKS = 3, 20
-_LEAST_VIEW = 0.15
+_LEAST_VIEW, _FEWEST_MAPPED, _LEAST_SPAN = 0.45, 100, 0.5
 _STILL_PX, _NO_PARALLAX_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.5
 _LEAST_INLIERS = 0.6
+_LEAST_GAIN, _FAR = 1.5, 0.05
+"""By how much a map must explain tracks better than a rotation does; and inverse depth over the usual one below which
+a point is as good as infinitely far."""
 _TRY_PARALLAX = "move the camera sideways by a tenth of the distance of what it sees, or give a trajectory"
-
-
-@dataclass(frozen=True)
-class OdometrySettings:
-    """How an initial trajectory is estimated."""
-
-    keyframe_px: float = 5.0
-    """How far things move between keyframes, usually."""
-    memory_px: float = 4.5
-    """How far they move in the time constant of the event images."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,7 @@ def estimated(
             f"{_SHORTEST_TRACK}, expected {_FEWEST_TRACKS} or more; a scene with more texture, or less noise"
         )
     focal_px = float(np.sqrt(camera.fx * camera.fy))
-    seen = view_share(tracks, camera.width * camera.height / (camera.fx * camera.fy))
+    seen = view_share(tracks, camera)
     if seen < _LEAST_VIEW:
         raise OdometryError(
             f"{file.path}: features in {seen:.0%} of the view alone, expected {_LEAST_VIEW:.0%} or more; "
@@ -119,7 +113,7 @@ def _judged(
     if parallax_px < _NO_PARALLAX_PX:
         return _of_rotation(tracks, t_us, rotation, focal_px, seen)
     whole = mapped(tracks, focal_px, rotation)
-    found, why = None, f"no two keyframes begin a map; {_TRY_PARALLAX}"
+    found, gain, why = None, np.inf, f"no two keyframes begin a map; {_TRY_PARALLAX}"
     if whole is not None:
         kept = explained(whole, tracks)
         inside = kept[tracks.image]
@@ -128,17 +122,35 @@ def _judged(
             f"one camera's motion explains {inliers:.0%} of the features' in {kept.sum()} of {len(t_us)} keyframes; "
             "objects that move by themselves, or too little texture?"
         )
-        if inliers >= _LEAST_INLIERS:
+        gain = parallax_px / max(_by_track_px(whole), 1e-9)
+        if gain < _LEAST_GAIN:
+            why = f"no parallax, a rotation leaves {parallax_px:.1f} px unexplained; {_TRY_PARALLAX}"
+        elif inliers >= _LEAST_INLIERS:
             progress("checking")
             halves = [mapped(halved(tracks, which), focal_px, rotation) for which in (0, 1)]
             why = f"either half of the features tells another motion; {_TRY_PARALLAX}"
             if halves[0] is not None and halves[1] is not None:
                 found = agreement(whole, halves[0], halves[1], kept)
     if whole is not None and found is not None:
-        return _of_map(whole, found, t_us, focal_px, parallax_px, seen)
+        estimate = _of_map(whole, found, t_us, focal_px, parallax_px, seen)
+        if estimate.quality.tracks >= _FEWEST_MAPPED and estimate.quality.span_share >= _LEAST_SPAN:
+            return estimate
+        why = (
+            f"{estimate.quality.tracks} features over {estimate.quality.span_share:.0%} of the time tell of one "
+            f"motion, expected {_FEWEST_MAPPED} over {_LEAST_SPAN:.0%}; objects that move by themselves, or too little texture?"
+        )
     if parallax_px < _LITTLE_PARALLAX_PX:
         return _of_rotation(tracks, t_us, rotation, focal_px, seen)
     raise OdometryError(f"{file.path}: no trajectory to vouch for: {why}")
+
+
+def _by_track_px(whole: Map) -> float:
+    """Median by track of the root mean square residual."""
+    residual = whole.residuals_px()
+    known = np.isfinite(residual)
+    track = whole.tracks.track[known]
+    count = np.bincount(track)
+    return float(np.median(np.sqrt(np.bincount(track, residual[known] ** 2)[count > 0] / count[count > 0])))
 
 
 def _of_map(
@@ -148,6 +160,8 @@ def _of_map(
     residual = whole.residuals_px()[np.isin(whole.tracks.image, image)]
     good = np.nonzero((whole.residuals_px() < INLIER_PX) & np.isin(whole.tracks.image, image))[0]
     number = np.unique(whole.tracks.track[good])
+    # The others are anywhere: nothing tells how far.
+    number = number[bundle.point[number, 2] > _FAR * float(np.median(bundle.point[number, 2]))]
     points = bundle.positions()[number]
     usual = float(np.median(np.linalg.norm(points - np.median(bundle.centre[image], axis=0), axis=1)))
     quat_xyzw = Rotation.from_matrix(bundle.rotation[image].transpose(0, 2, 1)).as_quat()
@@ -155,7 +169,7 @@ def _of_map(
         kind="six degrees of freedom",
         span_share=float((t_us[image[-1]] - t_us[image[0]]) / (t_us[-1] - t_us[0])),
         keyframes=len(image),
-        tracks=len(number),
+        tracks=len(np.unique(whole.tracks.track[good])),
         inlier_share=float((residual < INLIER_PX).mean()),
         reprojection_px=float(np.sqrt(np.mean(residual[residual < INLIER_PX] ** 2))),
         parallax_px=parallax_px,

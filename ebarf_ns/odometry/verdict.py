@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float64, Int64
 
+    from ebarf_ns.geometry.cameras import Camera
     from ebarf_ns.odometry.mapping import Map
     from ebarf_ns.odometry.tracks import Tracks
 
@@ -23,6 +23,7 @@ _SHARES, _PLACES = (1.0, 0.8, 0.6, 0.4), 9
 _FEWEST_COMPARED = 6
 _MOST_APART, _MOST_TURNED_RAD = 0.05, 0.06
 _SMOOTHED = 2.0
+_CELLS = (8, 6)
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Quality:
     """Root mean square of half the difference between the trajectories by either half of the tracks, over the extent
     of the path; none of a rotation."""
     view_share: float
-    """Of the picture: what the tracks span, median of the keyframes."""
+    """Of the picture, cut into 8 x 6 cells: those with a track, median of the keyframes."""
 
 
 class Agreement(NamedTuple):
@@ -109,13 +110,11 @@ def _aligned(half: Map, whole: Map, image: Int64[np.ndarray, "images"]) -> tuple
     return rotation, goal.mean(axis=0) + scale * offset
 
 
-def view_share(tracks: Tracks, camera_area: float) -> float:
-    """What the tracks span of the picture, median of the keyframes; areas are on the plane at distance 1."""
-    shares = []
-    for image in np.unique(tracks.image):
-        plane = tracks.plane[tracks.image == image]
-        try:
-            shares.append(ConvexHull(plane).volume / camera_area)
-        except (QhullError, ValueError):
-            shares.append(0.0)
-    return float(np.median(shares)) if shares else 0.0
+def view_share(tracks: Tracks, camera: Camera) -> float:
+    """Of the picture, cut into 8 x 6 cells: those with a track, median of the keyframes."""
+    pixel = tracks.plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    cell = (pixel / [camera.width, camera.height] * _CELLS).clip(0, np.array(_CELLS) - 1).astype(np.int64)
+    images = int(tracks.image.max()) + 1
+    taken = np.zeros((images, *_CELLS), bool)
+    taken[tracks.image, cell[:, 0], cell[:, 1]] = True
+    return float(np.median(taken.mean(axis=(1, 2))))
