@@ -1,6 +1,6 @@
 """``ebarf trajectory estimate``: an initial trajectory from the events of a scene or a recording."""
-from __future__ import annotations
 
+from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
@@ -43,9 +43,10 @@ class TrajectoryEstimate:
 
         stderr = Console(stderr=True)
         columns = TextColumn("{task.description}"), SpinnerColumn(), TimeElapsedColumn()
-        with tempfile.TemporaryDirectory() as folder, Progress(
-            *columns, transient=True, console=stderr, disable=not stderr.is_terminal
-        ) as progress:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            Progress(*columns, transient=True, console=stderr, disable=not stderr.is_terminal) as progress,
+        ):
             task = progress.add_task("reading", total=None)
             say = lambda step: progress.update(task, description=step)  # noqa: E731
             estimate, output, completed = self._estimate(Path(folder), say)
@@ -69,7 +70,9 @@ class TrajectoryEstimate:
             output = self.output or Path("trajectory.txt")
         for path in (output, output.with_name("points.ply"), output.with_name("odometry.json")):
             if path.exists():
-                raise SceneError(f"{path}: exists, expected --output with a new file's name, in a folder without {path.name}")
+                raise SceneError(
+                    f"{path}: exists, expected --output with a new file's name, in a folder without {path.name}"
+                )
         if not is_scene:
             settings = ProcessSettings(camera=self.camera, camera_name=self.camera_name, part=self.part, frames=False)
             process("auto", self.source, folder / "scene", settings)

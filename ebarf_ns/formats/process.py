@@ -269,7 +269,8 @@ def _assemble(
     notes += [f"suspicious: {contradicted}"] if contradicted else []
     taken_along = "" if len(frames) == within else f", {len(frames)} of which are taken along"
     notes.append(
-        f"{len(initial.t_us) if initial else 'no'} keyframes around the events, {within} of {seen} frames within their span{taken_along}"
+        f"{len(initial.t_us) if initial else 'no'} keyframes around the events, "
+        f"{within} of {seen} frames within their span{taken_along}"
     )
     return report.sentences() + notes
 

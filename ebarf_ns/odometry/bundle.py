@@ -36,9 +36,7 @@ class Bundle:
     point: Float64[np.ndarray, "points 3"]
     """u, v and inverse depth."""
 
-    def projected(
-        self, image: Int64[np.ndarray, "n"], point: Int64[np.ndarray, "n"]
-    ) -> Float64[np.ndarray, "n 2"]:
+    def projected(self, image: Int64[np.ndarray, "n"], point: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 2"]:
         """On the planes at 1; infinite behind a camera."""
         u, v, inverse = self.point[point].T
         ray = np.einsum("nij,nj->ni", self.axes[point], np.stack([u, v, np.ones_like(u)], axis=1))
@@ -148,7 +146,7 @@ def _move(bundle: Bundle, free: np.ndarray, seen: np.ndarray, step: np.ndarray, 
 
 
 @njit(cache=True)
-def _seen(rotation, centre, anchor, axes, point):  # noqa: ANN001, ANN202
+def _seen(rotation, centre, anchor, axes, point):
     """A point in a camera's frame, times its inverse depth; from its anchor, and along its axes."""
     away = anchor - centre
     ray = axes[:, 0] * point[0] + axes[:, 1] * point[1] + axes[:, 2]
@@ -156,7 +154,7 @@ def _seen(rotation, centre, anchor, axes, point):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _cost(image, point, plane, rotation, centre, anchor, axes, points, focal_px, robust_px):  # noqa: ANN001, ANN202
+def _cost(image, point, plane, rotation, centre, anchor, axes, points, focal_px, robust_px):
     total = 0.0
     for n in range(len(image)):
         k, p = image[n], point[n]
@@ -170,8 +168,8 @@ def _cost(image, point, plane, rotation, centre, anchor, axes, points, focal_px,
 
 
 @njit(cache=True)
-def _equations(  # noqa: ANN202
-    image, number, point, row, plane, rotation, centre, anchor, axes, points, cameras, seen, focal_px, robust_px  # noqa: ANN001
+def _equations(
+    image, number, point, row, plane, rotation, centre, anchor, axes, points, cameras, seen, focal_px, robust_px
 ):
     """Cost, and the blocks of the normal equations: cameras, their gradients, points, theirs, and what couples them."""
     camera, camera_gradient = np.zeros((cameras, 6, 6)), np.zeros((cameras, 6))
@@ -220,7 +218,7 @@ def _equations(  # noqa: ANN202
 
 
 @njit(cache=True)
-def _eliminate(whole, right, mixed, inverse, gradient, number, first) -> None:  # noqa: ANN001
+def _eliminate(whole, right, mixed, inverse, gradient, number, first) -> None:
     """Take from the cameras' equations what the points explain: their Schur complement, in place."""
     for p in range(len(first) - 1):
         for n in range(first[p], first[p + 1]):

@@ -137,7 +137,8 @@ def _judged(
             return estimate
         why = (
             f"{estimate.quality.tracks} features over {estimate.quality.span_share:.0%} of the time tell of one "
-            f"motion, expected {_FEWEST_MAPPED} over {_LEAST_SPAN:.0%}; objects that move by themselves, or too little texture?"
+            f"motion, expected {_FEWEST_MAPPED} over {_LEAST_SPAN:.0%}; objects that move by themselves, or too little "
+            "texture?"
         )
     if parallax_px < _LITTLE_PARALLAX_PX:
         return _of_rotation(tracks, t_us, rotation, focal_px, seen)

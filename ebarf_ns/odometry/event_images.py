@@ -35,7 +35,8 @@ def event_images(
 ) -> Iterator[UInt8[np.ndarray, "height width"]]:
     """Grey pictures at rising times, mid grey where nothing changes; read a stretch of the recording at a time.
 
-    The time constant is on the clock of ``pace``; ``threshold_ratio`` is C_on / C_off; pixels ``left_out`` get the mean of their neighbours.
+    The time constant is on the clock of ``pace``; ``threshold_ratio`` is C_on / C_off; pixels ``left_out`` get the mean
+    of their neighbours.
     """
     width, height = file.width, file.height
     up, down = np.sqrt(threshold_ratio), -1 / np.sqrt(threshold_ratio)

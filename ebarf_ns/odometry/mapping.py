@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from ebarf_ns.odometry.bundle import Bundle, adjust
 from ebarf_ns.odometry.rotation import Turned
@@ -116,7 +116,9 @@ def _begun(tracks: Tracks, focal_px: float, turned: Turned, first: int, last: in
     rest = (Rotation.from_matrix(rotation @ turned.rotation[first]) * start[-1].inv()).as_rotvec()
     bundle.rotation[images] = (Rotation.from_rotvec(share[:, None] * rest) * start).as_matrix()
     bundle.centre[images] = share[:, None] * -(bundle.rotation[last].T @ translation[:, 0])
-    begun = Map(tracks, focal_px, bundle, np.isin(np.arange(count), images), np.zeros(number, bool), np.arange(number) < known)
+    begun = Map(
+        tracks, focal_px, bundle, np.isin(np.arange(count), images), np.zeros(number, bool), np.arange(number) < known
+    )
     _add_points(begun, usual=0.2)
     for robust_px in (3.0, _ROBUST_PX):
         _adjust(begun, images[1:], images, robust_px, rounds=25)
@@ -225,7 +227,14 @@ def _adjust(
     visible[tracks.track[free[tracks.image]]] = True
     rows = np.nonzero(held[tracks.image] & (visible & whole.pointed)[tracks.track])[0]
     adjust(
-        whole.bundle, tracks.image[rows], tracks.track[rows], tracks.plane[rows], free, whole.focal_px, robust_px, rounds
+        whole.bundle,
+        tracks.image[rows],
+        tracks.track[rows],
+        tracks.plane[rows],
+        free,
+        whole.focal_px,
+        robust_px,
+        rounds,
     )
 
 

@@ -37,9 +37,7 @@ def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
         say(sentence)
 
 
-def of_scene(
-    scene: Scene, settings: OdometrySettings, progress: Callable[[str], None] = lambda step: None
-) -> Estimate:
+def of_scene(scene: Scene, settings: OdometrySettings, progress: Callable[[str], None] = lambda step: None) -> Estimate:
     """The estimate of a scene's recording, with the ratio of thresholds that the scene states or the events tell."""
     file = RecordingFile(scene.events, scene.camera.width, scene.camera.height)
     threshold = scene.contrast_threshold
@@ -99,7 +97,10 @@ def sentences(estimate: Estimate) -> list[str]:
             f"uncertainty of a keyframe, by estimates from either half of the tracks: {np.median(share):.1%} (at most "
             f"{share.max():.1%}) of the path's extent, {turns}",
         ]
-    return [*found, f"uncertainty of a keyframe: {turns}; rotation alone leaves {quality.parallax_px:.1f} px unexplained"]
+    return [
+        *found,
+        f"uncertainty of a keyframe: {turns}; rotation alone leaves {quality.parallax_px:.1f} px unexplained",
+    ]
 
 
 def estimated_bounds(estimate: Estimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
