@@ -27,6 +27,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
         synced(path.parent)
+    except OSError as error:
+        # A full disk does not say of itself what found it full.
+        error.filename = error.filename or str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -51,10 +55,20 @@ def whole_folder(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
         if path.exists():
-            shutil.rmtree(path)
-        temporary.replace(path)
+            # Put away before it is removed, which takes its time.
+            before = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+            path.replace(before)
+            temporary.replace(path)
+            shutil.rmtree(before, ignore_errors=True)
+        else:
+            temporary.replace(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def is_special(path: Path) -> bool:
+    """Whether a path names a pipe, a socket or a device: to read one may take for ever."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @contextmanager

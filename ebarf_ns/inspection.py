@@ -1,6 +1,7 @@
 """What is in a scene folder, and what looks wrong in it."""
 
 from dataclasses import dataclass, field
+from math import atan2, degrees
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correla
 from ebarf_ns.events.pixels import hot_pixels
 from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import Estimate, SensorFacts, identify_recording
+from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
@@ -21,6 +23,9 @@ from ebarf_ns.printing import print_facts, print_line
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
 
 _FEW_EVENTS_PER_PIXEL = 5
+_FEW_PIXELS = 0.005
+# Lenses that see more, or less, are rarer than focal lengths in another unit.
+_WIDEST_DEG, _WIDEST_FISHEYE_DEG, _NARROWEST_DEG = 150, 240, 2
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,16 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
         found.append(
             f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"
         )
+    active = round((1 - summary.silent_pixel_share) * summary.width * summary.height)
+    if active <= _FEW_PIXELS * summary.width * summary.height:
+        found.append(f"all events are at {active:,} of {summary.width * summary.height:,} pixels: columns mixed up?")
+    found.extend(_view(scene.camera))
+    if scene.bounds is not None:
+        lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
+        position = trajectory.poses.position
+        away = float(((position < lower) | (position > upper)).any(dim=-1).double().mean())
+        if away > 0:
+            found.append(f"{away:.0%} of the keyframes lie outside the bounds: they must hold all that is seen")
     if summary.path_length == 0:
         found.append("the trajectory does not move: depth cannot be seen without translation")
     gaps_us = trajectory.t_us.diff()
@@ -167,6 +182,20 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
             "you know how far away the farthest thing is, ebarf process has --farthest"
         )
     return found
+
+
+def _view(camera: Camera) -> list[str]:
+    """How wide the camera sees, where that is hardly what is meant."""
+    sides = ((camera.width, camera.fx), (camera.height, camera.fy))
+    fisheye = camera.model == "equidistant"
+    angles = [degrees(side / focal) if fisheye else degrees(2 * atan2(side / 2, focal)) for side, focal in sides]
+    widest = _WIDEST_FISHEYE_DEG if fisheye else _WIDEST_DEG
+    if _NARROWEST_DEG <= min(angles) and max(angles) <= widest:
+        return []
+    return [
+        f"the camera sees {angles[0]:.3g} by {angles[1]:.3g} degrees, by focal lengths of {camera.fx:.4g} and "
+        f"{camera.fy:.4g} px: in another unit, or of another size of sensor?"
+    ]
 
 
 def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ebarf_ns.errors import SceneError, did_you_mean
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import is_special, whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,15 +23,18 @@ def write_json(path: Path, content: object) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """What a file holds; raises :class:`SceneError`."""
+    """The content of a JSON file; raises :class:`SceneError`."""
+    if is_special(path):
+        raise SceneError(f"{path}: a pipe or a device, expected a file")
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: byte {error.start} is not UTF-8 text") from None
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise SceneError(f"{path}: not valid JSON ({error})") from None
+    except (ValueError, RecursionError) as error:
+        # Among them numbers of thousands of digits, which python does not take.
+        raise SceneError(f"{path}: not valid JSON ({str(error).split(';')[0]})") from None
 
 
 class JsonObject:
@@ -67,12 +71,18 @@ class JsonObject:
             raise self.wrong(key, "a JSON object")
         return JsonObject(self.path, self.name(key), self.get(key))
 
-    def file(self, key: str, must_exist: bool = True) -> Path:
-        """The file that a key names, relative to the file that it stands in."""
+    def file(self, key: str, must_exist: bool = True, absolute: bool = False) -> Path:
+        """The path of a file that lies in this one's folder, or anywhere if its path is ``absolute`` and may be."""
         name = self.get(key)
-        if not isinstance(name, str) or not name:
+        if not isinstance(name, str) or not name or not name.isprintable():
             raise self.wrong(key, "a file name")
-        path = self.path.parent / name
+        folder = self.path.parent
+        path = folder / name
+        outside = ".." in os.path.relpath(path, folder).split(os.sep)
+        if outside and not (absolute and Path(name).is_absolute()):
+            raise self.wrong(key, "a file in the folder of this one")
+        if path.exists() and not path.is_file():
+            raise SceneError(f"{self.path}: {self.name(key)} names {name!r}, which is no file")
         if must_exist and not path.is_file():
             raise SceneError(
                 f"{self.path}: {self.name(key)} names {name!r}, but there is no file {path}{did_you_mean(path)}"

@@ -1,7 +1,7 @@
-"""What a scene needs, decided by looking at it: every line with its reason, and overridable by the flag it names.
+"""Automatic configuration from the scene: every decision has a reason and can be overridden by the flag it names.
 
-A field of the configuration that is None is for the plan to decide; what it decided is written into the run's
-``config.yml`` and into the header of its metrics.
+A configuration field that is None is set by the plan; the decision is written into the run's ``config.yml`` and the
+header of its metrics.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ebarf_ns.scene import Scene
 
 _GROWTH = 1.6
-# What is not straight between learned corrections may be noise, which then stays: a fifth of a pixel cost 1 to 2 dB.
+# Nonlinear motion between learned corrections may be noise, which then remains: a fifth of a pixel cost 1 to 2 dB.
 _STRAIGHT_PX = 0.05
 _AS_GOOD_AS_STRAIGHT_PX = 0.02
 _UNEVEN = 4.0
@@ -41,13 +41,13 @@ class Line:
     """One decision."""
 
     field: str
-    """Where in the run's configuration, in dots."""
+    """Dotted path in the run's configuration."""
     value: Any
     reason: str
 
     @property
     def flag(self) -> str:
-        """What overrides it on the command line."""
+        """The command-line flag that overrides the decision."""
         return "--" + self.field.replace("_", "-")
 
 
@@ -61,18 +61,18 @@ def plan_for(
     normalized: bool = False,
     facts: SensorFacts = UNKNOWN_SENSOR,
 ) -> list[Line]:
-    """Decide for a scene, the trajectory that training begins from and a number of events, on "cpu" or "cuda".
+    """Plan for a scene, the initial trajectory and a number of events, on "cpu" or "cuda".
 
-    What is decided from the grid's coarsest and finest level follows those given, where they are; ``normalized`` is
-    the paper's Eq. 6; ``facts`` are those of the recording.
+    Decisions that depend on the grid's coarsest and finest level use ``coarsest`` and, if given, ``finest_given``;
+    ``normalized`` selects the paper's Eq. 6; ``facts`` are those of the recording.
     """
     far_side = _far_side(scene, trajectory)
     bounded, distance = far_side is not None, far_side and far_side[0]
     finest, why = _finest(scene.camera.fx, far_side)
-    # Of contracted space, a view sees less than half the width.
-    told = max(round(sqrt(events)) * (1 if bounded else 2), 32)
-    if finest > told:
-        finest, why = told, f"so that what is seen has a cell for each event; pixels would resolve {finest}"
+    # A view covers less than half the width of contracted space.
+    supported = max(round(sqrt(events)) * (1 if bounded else 2), 32)
+    if finest > supported:
+        finest, why = supported, f"one cell per event over a visible surface; pixels would resolve {finest}"
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
@@ -80,7 +80,7 @@ def plan_for(
     dense, _ = densified(trajectory, gap_us, _spline_if_even(trajectory))
     stride, straight = _stride(trajectory, scene.camera.fx, distance)
     if len(dense.t_us) > len(trajectory.t_us):
-        stride, straight = 1, "keyframes are inserted: each is learned"
+        stride, straight = 1, "keyframes are inserted, and each is learned"
     precision = fastest_precision(device)
     rays = 16384 if device == "cuda" else 1024
     return [
@@ -101,22 +101,22 @@ def plan_for(
         Line(
             "pipeline.model.broad_cells",
             16,
-            "brightness at large is learned as quickly as edges: slopes across a room otherwise come last",
+            "low-frequency brightness is learned as fast as edges; gradients across a room otherwise come last",
         ),
         Line(
             "pipeline.model.density_cells",
             int(np.clip(finest, 32, 128)),
-            "as the finest level, up to 128: the better remembered, the fewer samples do",
+            "as the finest level, up to 128: a finer density cache needs fewer samples",
         ),
         Line(
             "pipeline.model.samples",
             16,
-            "the remembered density says where the surface is: more cost steps and brought nothing",
+            "the density cache locates surfaces: more samples cost steps and improved nothing",
         ),
         Line(
             "pipeline.model.precision",
             precision,
-            "this processor multiplies bfloat16 natively" if precision == "bfloat16" else "no native bfloat16 here",
+            "native bfloat16 on this processor" if precision == "bfloat16" else "no native bfloat16 on this processor",
         ),
         Line("pipeline.model.camera_optimizer.longest_gap_us", gap_us, gaps),
         Line("pipeline.model.camera_optimizer.keyframe_stride", stride, straight),
@@ -124,7 +124,7 @@ def plan_for(
         Line(
             "pipeline.datamanager.silent_share",
             0.0 if normalized else 0.125,
-            "Eq. 6 has no unit for what silence allows"
+            "Eq. 6 has no threshold unit for silent pixels"
             if normalized
             else "a silent pixel has changed by less than a threshold",
         ),
@@ -136,29 +136,29 @@ def plan_for(
 
 
 def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Line]:
-    """What the sensor is taken to be: as the scene states it, else as the recording shows it."""
+    """Sensor parameters: as given in the scene, else as estimated from the recording."""
     blind, ratio = facts.refractory_us, facts.threshold_ratio
     if scene.refractory_us is not None:
-        refractory_us, blind_why = scene.refractory_us, "as scene.json states it"
+        refractory_us, blind_why = scene.refractory_us, "given in scene.json"
     else:
         refractory_us = round(blind.value)
         blind_why = (
-            f"found by the intervals at a pixel: {blind.low:.0f} to {blind.high:.0f} us"
+            f"estimated from event intervals: {blind.low:.0f} to {blind.high:.0f} us"
             if refractory_us
-            else f"intervals at a pixel, the shortest {blind.high:.0f} us, show no blind time"
+            else f"event intervals, the shortest {blind.high:.0f} us, show no refractory period"
         )
     stated = scene.contrast_threshold
     if stated:
-        value, deviation, ratio_why = stated.on / stated.off, 0.0, "as scene.json states the thresholds"
+        value, deviation, ratio_why = stated.on / stated.off, 0.0, "thresholds given in scene.json"
     else:
         value, deviation = ratio.value, log(ratio.high / ratio.low) / 4
-        ratio_why = f"by events that must cancel: {ratio.low:.2f} to {ratio.high:.2f}"
+        ratio_why = f"estimated from events that must cancel: {ratio.low:.2f} to {ratio.high:.2f}"
     blank = 0.0 if normalized else _MOST_BLANK * facts.blank_share
     return [
         Line(
             "pipeline.datamanager.doubles_us",
             facts.doubles_us,
-            f"{facts.doubles_share:.1%} of the events repeat the one before within that time"
+            f"{facts.doubles_share:.1%} of the events repeat the previous one within that time"
             if facts.doubles_us
             else "no crossing is reported twice",
         ),
@@ -169,21 +169,21 @@ def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Li
         Line(
             "pipeline.model.threshold_deviation",
             deviation,
-            "how far training may refine the ratio" if deviation else "stated: nothing to refine",
+            "range within which training refines the ratio" if deviation else "thresholds given: nothing to refine",
         ),
     ]
 
 
 def _time_constant(scene: Scene, normalized: bool) -> tuple[float | None, str]:
     if normalized:
-        return 0.0, "Eq. 6 takes events for immediate"
+        return 0.0, "Eq. 6 assumes events without delay"
     if scene.time_constant_us is not None:
-        return scene.time_constant_us, "as scene.json states it"
-    return None, "learned from 0 up: what delays events shows in training alone, and costs nothing where it is 0"
+        return scene.time_constant_us, "given in scene.json"
+    return None, "learned from 0 up: event delays only show in training, and learning them costs nothing at 0"
 
 
 def apply_plan(lines: list[Line], configuration: Any) -> list[Line]:
-    """Fill in what is None in ``configuration``; returns the lines as they are in force."""
+    """Fill in fields of ``configuration`` that are None; returns the lines in effect."""
     in_force = []
     for line in lines:
         *path, name = line.field.split(".")
@@ -198,13 +198,13 @@ def apply_plan(lines: list[Line], configuration: Any) -> list[Line]:
 
 
 def _finest(focal_px: float, far_side: tuple[float, float] | None) -> tuple[int, str]:
-    """Cells per side of the finest level: one for each pixel's footprint where the scene is."""
+    """Cells per side of the finest level: one per pixel footprint at the scene's distance."""
     if far_side is None:
-        # Contracted space is four units wide, and a pixel's footprint in it about 2 / focal_px from one unit on.
+        # Contracted space is four units wide; a pixel's footprint in it is about 2 / focal_px beyond one unit.
         finest = int(np.clip(2 * focal_px, 64, 2048))
         return (
             finest,
-            "twice the focal length in pixels, within 64 and 2048: a pixel's footprint beyond the near field",
+            "twice the focal length in pixels, from 64 to 2048: a pixel's footprint beyond the near field",
         )
     distance, size = far_side
     finest = int(np.clip(round(size * focal_px / distance), 64, 2048))
@@ -216,7 +216,7 @@ def _finest(focal_px: float, far_side: tuple[float, float] | None) -> tuple[int,
 
 
 def _far_side(scene: Scene, trajectory: Trajectory) -> tuple[float, float] | None:
-    """Median distance to the far side of the bounds over keyframes and directions, and the bounds' widest side."""
+    """Median distance to the far side of the bounds over keyframes and directions, and the bounds' largest side."""
     if scene.bounds is None:
         return None
     centre, scale, half_sides = box_of_bounds(scene.bounds)
@@ -239,7 +239,7 @@ def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:
 
 
 def _stride(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
-    """How far apart corrections are learned: as far as the motion between is straight to a 20th of a pixel."""
+    """Largest spacing of learned corrections for which the motion between is linear to 1/20 of a pixel."""
     keyframes = len(trajectory.t_us)
     stride, off_px = 1, 0.0
     while 2 * stride * 4 <= keyframes:
@@ -249,19 +249,18 @@ def _stride(trajectory: Trajectory, focal_px: float, distance: float | None) -> 
         stride, off_px = 2 * stride, wider
     rate = (keyframes - 1) / (float(trajectory.t_us[-1] - trajectory.t_us[0]) * 1e-6)
     if keyframes < 8:
-        return 1, f"there are but {keyframes} keyframes"
+        return 1, f"only {keyframes} keyframes"
     if stride == 1:
-        return 1, f"{rate:.0f} keyframes a second: further apart, motion or the noise in it is not straight"
-    return stride, f"{rate:.0f} keyframes a second: between every {stride}th, the motion is straight to {off_px:.2g} px"
+        return 1, f"{rate:.0f} keyframes per second: over longer intervals, the motion or its noise is not linear"
+    return stride, f"{rate:.0f} keyframes per second: between every {stride}th, motion is linear to {off_px:.2g} px"
 
 
 def _longest_gap(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[int, str]:
-    """How far apart keyframes may be, in microseconds; 0: as far as they are."""
+    """Largest allowed gap between keyframes, in microseconds; 0: insert none."""
     gaps_us = trajectory.t_us.diff()
     usual_us, longest_us = int(gaps_us.median()), int(gaps_us.max())
     kind = _spline_if_even(trajectory)
-    # Halving the distance between knots leaves a quarter of what is not straight, and an eighth at most of what no
-    # spline follows.
+    # Halving the knot spacing divides the error by 4 for linear interpolation, and by at least 8 for a spline.
     shrinks = 8 if kind == "cubic" else 4
     off_px = _off_px(trajectory, 2, focal_px, distance, kind) / shrinks
     pieces, left_px = 1, off_px
@@ -271,8 +270,8 @@ def _longest_gap(trajectory: Trajectory, focal_px: float, distance: float | None
     if pieces == 1 and longest_us < 2 * gap_us:
         return 0, f"between keyframes the motion is known to {off_px:.2g} px"
     if pieces == 1:
-        return gap_us, f"gaps of up to {longest_us} us between keyframes that are {usual_us} us apart as a rule"
-    return gap_us, f"between keyframes, {usual_us} us apart, the motion is unknown by {off_px:.2g} px"
+        return gap_us, f"gaps of up to {longest_us} us between keyframes with a median spacing of {usual_us} us"
+    return gap_us, f"between keyframes, {usual_us} us apart, the motion is uncertain by {off_px:.2g} px"
 
 
 def _unevenness(trajectory: Trajectory) -> float:
@@ -285,24 +284,24 @@ def _spline_if_even(trajectory: Trajectory) -> Interpolation:
 
 
 def _interpolation(trajectory: Trajectory, focal_px: float, distance: float | None) -> tuple[Interpolation, str]:
-    """A spline where the motion between keyframes is no straight line, if they are spaced evenly enough for one."""
+    """A spline if the motion between keyframes is nonlinear and their spacing is even enough."""
     keyframes = len(trajectory.t_us)
     if _spline_if_even(trajectory) == "linear":
         uneven = _unevenness(trajectory)
         return "linear", f"{keyframes} keyframes, gaps between them up to {uneven:.3g} times the shortest: no spline"
-    # Halving the distance between knots leaves a quarter of what is not straight.
+    # Halving the knot spacing divides the deviation from a line by 4.
     off_px = _off_px(trajectory, 2, focal_px, distance) / 4
     if off_px < _AS_GOOD_AS_STRAIGHT_PX:
-        return "linear", f"between keyframes the motion is straight to {off_px:.2g} px"
-    return "cubic", f"between keyframes the motion is off a straight line by {off_px:.2g} px"
+        return "linear", f"between keyframes the motion is linear to {off_px:.2g} px"
+    return "cubic", f"between keyframes the motion deviates from a line by {off_px:.2g} px"
 
 
 def _off_px(
     trajectory: Trajectory, stride: int, focal_px: float, distance: float | None, kind: Interpolation = "linear"
 ) -> float:
-    """How far keyframes are from what each ``stride``-th of them would say, root mean square, in pixels.
+    """RMS error, in pixels, of predicting the keyframes from every ``stride``-th one.
 
-    Without a known distance, four times the trajectory's radius stands for it.
+    An unknown scene distance is replaced by four times the trajectory's radius.
     """
     knots = torch.arange(0, len(trajectory.t_us) - 1, stride)
     knots = torch.cat([knots, torch.tensor([len(trajectory.t_us) - 1])])

@@ -26,6 +26,9 @@ FORMAT, VERSION = "ebarf-scene", 1
 _LONGEST_SPAN_RATIO = 100
 _LONGEST_REFRACTORY_US = 1_000_000
 _LONGEST_TIME_CONSTANT_US = 1_000_000
+# Far beyond what there is: what is larger is a mistake, for which no memory is asked.
+_MOST_PIXELS, _MOST_SIDES, _MOST_EXTENT, _MOST_THRESHOLD = 1 << 26, 1e4, 1e9, 1e3
+_LATEST_US = 1 << 61
 _SENSOR_KEYS = "contrast_threshold refractory_us time_constant_us"
 _KEYS = f"format version events trajectory groundtruth frames camera {_SENSOR_KEYS} bounds"
 FrameIntensity = Literal["linear", "srgb", "log"]
@@ -85,15 +88,15 @@ def read_scene(folder: Path, trajectory_to_come: bool = False) -> Scene:
         raise SceneError(f"{folder}: {what}, expected a scene folder with scene.json in it{did_you_mean(folder)}")
     content = JsonObject(path, "", read_json(path))
     content.only(_KEYS.split())
-    for key, expected in (("format", FORMAT), ("version", VERSION)):
-        if content.get(key) != expected:
-            raise SceneError(f"{path}: {key} is {content.get(key)!r}, expected {expected!r}")
+    content.choice("format", (FORMAT,))
+    if content.integer("version", positive=True) > VERSION:
+        raise content.wrong("version", f"at most {VERSION}: a newer ebarf_ns made it")
     camera = _camera(content.object("camera"))
     frames, missing = _read_frames(content.optional_file("frames", must_exist=False), camera)
     return Scene(
         folder=folder,
         # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
-        events=content.file("events", must_exist=False),
+        events=content.file("events", must_exist=False, absolute=True),
         trajectory=_trajectory(content, trajectory_to_come),
         camera=camera,
         groundtruth=content.optional_file("groundtruth"),
@@ -214,21 +217,35 @@ def _camera(content: JsonObject) -> Camera:
     counts = COEFFICIENTS[model]
     if not isinstance(distortion, list) or len(distortion) not in counts or not all(map(is_number, distortion)):
         raise content.wrong("distortion", f"a list of {' or '.join(map(str, counts))} numbers for model {model}")
+    width, height = (content.integer(key, positive=True) for key in ("width", "height"))
+    if width * height > _MOST_PIXELS:
+        raise content.wrong("width", f"at most {_MOST_PIXELS:,} pixels, with height {height:.6g}")
+
+    def sides(key: str, positive: bool = False) -> float:
+        """A number of pixels that makes sense beside those of the sensor."""
+        value, most = content.number(key, positive=positive), _MOST_SIDES * max(width, height)
+        if abs(value) > most or (positive and value < 1 / _MOST_SIDES):
+            raise content.wrong(key, f"{f'{1 / _MOST_SIDES} to ' if positive else 'within ±'}{most:.6g} pixels")
+        return value
+
     return Camera(
         model=model,
-        width=content.integer("width", positive=True),
-        height=content.integer("height", positive=True),
-        fx=content.number("fx", positive=True),
-        fy=content.number("fy", positive=True),
-        cx=content.number("cx"),
-        cy=content.number("cy"),
+        width=width,
+        height=height,
+        fx=sides("fx", positive=True),
+        fy=sides("fy", positive=True),
+        cx=sides("cx"),
+        cy=sides("cy"),
         distortion=tuple(float(value) for value in distortion),
     )
 
 
 def _threshold(content: JsonObject) -> ContrastThreshold:
     content.only(["on", "off"])
-    return ContrastThreshold(content.number("on", positive=True), content.number("off", positive=True))
+    for key in ("on", "off"):
+        if not 1 / _MOST_THRESHOLD <= content.number(key, positive=True) <= _MOST_THRESHOLD:
+            raise content.wrong(key, f"a number from {1 / _MOST_THRESHOLD:g} to {_MOST_THRESHOLD:g}")
+    return ContrastThreshold(content.number("on"), content.number("off"))
 
 
 def _refractory_us(content: JsonObject) -> int:
@@ -256,6 +273,8 @@ def _bounds(content: JsonObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
             raise content.wrong("bounds", expected)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise content.wrong("bounds", expected)
+    if max(map(abs, [*lower, *upper])) > _MOST_EXTENT:
+        raise content.wrong("bounds", f"{expected}, within ±{_MOST_EXTENT:g}")
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
@@ -280,6 +299,8 @@ def _frame(content: JsonObject, event_camera: Camera) -> Frame:
         rows = isinstance(extrinsic, list) and len(extrinsic) == 4 and all(isinstance(row, list) for row in extrinsic)
         if not rows or not all(len(row) == 4 and all(map(is_number, row)) for row in extrinsic):
             raise content.wrong("event_camera_from_frame_camera", "a 4x4 matrix of numbers")
+    if abs(content.integer("t_us")) > _LATEST_US:
+        raise content.wrong("t_us", f"microseconds within ±{_LATEST_US}")
     return Frame(
         path=content.file("file", must_exist=False),
         t_us=content.integer("t_us"),

@@ -1,4 +1,4 @@
-"""What is decided for a scene, why, and who may overrule it."""
+"""Planned configuration values, their reasons, and overrides."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ def test_parts_exist_only_where_the_scene_needs_them(scene: Scene):
     assert planned(dataclasses.replace(scene, bounds=None))["contract"] is True
 
 
-def test_silence_counts_where_thresholds_do(scene: Scene):
+def test_silent_pairs_need_thresholds(scene: Scene):
     trajectory = read_tum(scene.trajectory)
     shares = [
         line.value
@@ -94,7 +94,7 @@ def test_a_wall_is_as_near_as_the_bounds_say_in_its_direction(scene: Scene):
     assert line.value > 2 * planned(scene)["grid_finest"]
 
 
-def test_the_grid_is_no_finer_than_events_can_tell(scene: Scene):
+def test_the_grid_is_no_finer_than_events_support(scene: Scene):
     few = planned(dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, fx=500.0)), events=10_000)
     assert few["grid_finest"] == 100 and few["grid_table_size_log2"] == 13
     assert planned(scene, events=1)["grid_finest"] == 32 and planned(scene, events=1)["grid_table_size_log2"] == 10
@@ -147,7 +147,7 @@ def test_drift_between_keyframes_is_corrected_at_each(scene: Scene):
     assert planned(sharp, trajectory=drifting)["keyframe_stride"] == 1
 
 
-def test_what_was_set_stays_and_is_named():
+def test_set_values_stay_and_are_named():
     configuration = SimpleNamespace(model=SimpleNamespace(samples=None, grid_levels=5))
     lines = [Line("model.samples", 24, "enough"), Line("model.grid_levels", 8, "needed")]
     first, second = apply_plan(lines, configuration)
@@ -170,7 +170,7 @@ def test_inspect_prints_the_plan_a_run_keeps_and_flags_overrule(trained_run: Pat
 
 
 def swinging(keyframes: int, uneven: bool = False) -> Trajectory:
-    """Two seconds of turning to and fro, a radian a second at most."""
+    """Two seconds of oscillating rotation, at most one radian per second."""
     t_us = torch.linspace(0, 2e6, keyframes).round().long()
     if uneven:
         t_us[1] = t_us[0] + 1000
@@ -189,14 +189,12 @@ def swinging(keyframes: int, uneven: bool = False) -> Trajectory:
     ],
     ids=["20 Hz", "1000 Hz", "uneven", "few"],
 )
-def test_a_spline_only_where_the_motion_between_keyframes_needs_and_carries_it(
-    scene: Scene, trajectory: Trajectory, expected: str
-):
+def test_a_spline_is_used_only_if_the_motion_needs_and_supports_it(scene: Scene, trajectory: Trajectory, expected: str):
     assert planned(scene, trajectory=trajectory)["interpolation"] == expected
 
 
 def shaken(hertz: float, every_us: int, count: int) -> Trajectory:
-    """A camera that turns to and fro by a tenth of a radian, so many times a second."""
+    """A camera that oscillates by a tenth of a radian at the given frequency."""
     t_us = torch.arange(count) * every_us
     angle = 0.1 * torch.sin(2 * torch.pi * hertz * t_us.double() * 1e-6)
     zero = torch.zeros_like(angle)
@@ -209,7 +207,7 @@ def shaken(hertz: float, every_us: int, count: int) -> Trajectory:
     )
 
 
-def test_keyframes_are_inserted_where_those_given_do_not_tell_the_motion(scene: Scene):
+def test_keyframes_are_inserted_if_the_given_ones_undersample_the_motion(scene: Scene):
     swift, slow = shaken(1.5, 200_000, 11), shaken(0.1, 200_000, 11)
     assert 45_000 <= planned(scene, trajectory=swift)["longest_gap_us"] <= 100_000
     assert planned(scene, trajectory=swift)["keyframe_stride"] == 1

@@ -2,6 +2,8 @@
 
 import ast
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -68,6 +70,34 @@ def test_the_check_sees_what_it_should(source: str, names: list[str]):
 def test_nothing_is_called_that_windows_lacks():
     wrong = {path.name: unguarded(ast.parse(path.read_text(encoding="utf-8"))) for path in SOURCES}
     assert {name: names for name, names in wrong.items() if names} == {}
+
+
+LACKING_WINDOWS = """
+import importlib, os, pkgutil, signal, sys
+import aedat, cv2, evo.core, h5py, hdf5plugin, matplotlib.pyplot, numba, rosbags.rosbag2, scipy, torch, triton, tyro
+import ebarf_ns
+names = {names}
+for module, name in names:
+    if module in sys.modules and hasattr(sys.modules[module], name):
+        delattr(sys.modules[module], name)
+for module in {modules}:
+    sys.modules[module] = None
+found = [one.name for one in pkgutil.walk_packages(ebarf_ns.__path__, "ebarf_ns.") if ".nerf" not in one.name]
+for name in found:
+    importlib.import_module(name)
+from ebarf_ns.memory import peak_memory_mib
+print(len(found), peak_memory_mib())
+"""
+
+
+def test_all_but_the_plugin_is_imported_without_what_windows_lacks():
+    # What Python's own library asks for by itself on this system stays.
+    names = sorted(NAMES - {("os", name) for name in "waitpid getpid getppid uname sysconf geteuid getuid".split()})
+    script = LACKING_WINDOWS.format(names=names, modules=sorted(ONLY_UNIX_MODULES - {"posix", "pwd", "grp"}))
+    finished = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr[-2000:]
+    modules, memory_mib = finished.stdout.split()
+    assert int(modules) > 60 and float(memory_mib) >= 0
 
 
 def test_no_process_is_forked_and_no_picture_opened_by_name():

@@ -1,4 +1,5 @@
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,8 +61,19 @@ def camera(**changes: object) -> dict:
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        (changed(format="other"), "format is 'other', expected 'ebarf-scene'"),
-        (changed(version=2), "version is 2, expected 1"),
+        (changed(format="other"), "format is 'other', expected one of ebarf-scene"),
+        (changed(version=2), "version is 2, expected at most 1: a newer ebarf_ns made it"),
+        (changed(version=0), "version is 0, expected an integer above 0"),
+        (changed(events="a\x00b"), r"events is 'a\x00b', expected a file name"),
+        (changed(events="\ud800.h5"), r"events is '\ud800.h5', expected a file name"),
+        (changed(events="../events.h5"), "events is '../events.h5', expected a file in the folder of this one"),
+        (changed(trajectory="/etc/passwd"), "trajectory is '/etc/passwd', expected a file in the folder of this one"),
+        (camera(width=70_000, height=70_000), "camera.width is 70000, expected at most 67,108,864 pixels"),
+        (camera(width=10**4000), "expected at most 67,108,864 pixels"),
+        (camera(fx=1e300), "camera.fx is 1e+300, expected 0.0001 to"),
+        (camera(cx=-1e300), "camera.cx is -1e+300, expected within ±"),
+        (changed(bounds=[[-1e308] * 3, [1e308] * 3]), "on every axis, within ±1e+09"),
+        (changed(contrast_threshold={"on": 1e300, "off": 0.2}), "on is 1e+300, expected a number from"),
         (changed(evnets="x"), "unknown key evnets"),
         (changed(trajectory="gone.txt"), "trajectory names 'gone.txt', but there is no file"),
         (changed(events=3), "events is 3, expected a file name"),
@@ -95,6 +107,8 @@ def test_wrong_scene_names_file_key_value_and_expectation(tmp_path: Path, scene:
     ("frame", "words"),
     [
         ({**FRAME, "t_us": 1.5}, "[0].t_us is 1.5, expected an integer"),
+        ({**FRAME, "t_us": 10**30}, "expected microseconds within ±"),
+        ({**FRAME, "file": "../frame.png"}, "[0].file is '../frame.png', expected a file in the folder of this one"),
         ({**FRAME, "intensity": "gamma"}, "[0].intensity is 'gamma', expected one of linear, srgb, log"),
         ({**FRAME, "event_camera_from_frame_camera": [[1, 0], [0, 1]]}, "expected a 4x4 matrix"),
         ({**FRAME, "exposure": 1}, "unknown key [0].exposure"),
@@ -107,11 +121,19 @@ def test_wrong_frame_is_named(tmp_path: Path, frame: object, words: str):
     assert words in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe{}", b"[" * 100_000])
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe{}", b"[" * 100_000, b"[" + b"4" * 5_000 + b"]"])
 def test_broken_json_is_named(tmp_path: Path, content: bytes):
     make(tmp_path)
     (tmp_path / "scene.json").write_bytes(content)
     with pytest.raises(SceneError, match="scene.json"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["scene.json", "events.h5", "trajectory.txt"])
+def test_a_pipe_is_never_waited_for(tmp_path: Path, name: str):
+    (make(tmp_path) / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(SceneError, match=r"scene.json: (a pipe or a device|.* which is no file)"):
         read_scene(tmp_path)
 
 

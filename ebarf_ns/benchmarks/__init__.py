@@ -1,1 +1,1 @@
-"""Methods compared, and the engine timed."""
+"""Comparisons of methods, and timings of the engine."""

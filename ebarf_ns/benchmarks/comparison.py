@@ -1,4 +1,4 @@
-"""Methods x scenes x trajectories x seeds x seconds: trained one after another, stopped and gone on with at will."""
+"""Methods x scenes x trajectories x seeds x seconds, trained one after another; a stopped comparison can be resumed."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ class Job:
     seconds: float
 
     def name(self, *made_of: object) -> str:
-        """A folder's name, which changes with whatever the training is made of."""
+        """Folder name with a hash of everything that defines the training."""
         return _named(f"{self.scene}-{self.trajectory}-{self.seed}-{self.seconds:g}s-{self.method}", *made_of)
 
 
@@ -47,7 +47,7 @@ def _named(words: str, *made_of: object) -> str:
 
 
 def jobs(manifest: Manifest) -> list[Job]:
-    """All trainings, seed by seed, so that a comparison that is stopped has something of everything."""
+    """All trainings, seed by seed, so that a stopped comparison covers every combination."""
     found = dict.fromkeys(
         Job(name, scene, TRUE if method.role == "floor" else trajectory, seed, float(seconds))
         for seed in manifest.seeds
@@ -62,9 +62,9 @@ def jobs(manifest: Manifest) -> list[Job]:
 def run_comparison(
     manifest: Manifest, folder: Path, progress: Callable[[int, int, str], None] = lambda done, of, what: None
 ) -> dict[str, Any]:
-    """Train whatever has no result in ``folder`` yet; returns all results, which are in ``records.json`` as well.
+    """Run every training without a result in ``folder``; returns all results, also written to ``records.json``.
 
-    A training that fails is a result too: it has an ``error`` and no evaluations.
+    A failed training is a result too: it has an ``error`` and no evaluations.
     """
     todo = [job for job in jobs(manifest) if job.trajectory != TRUE or _has_reference(manifest.scenes[job.scene])]
     records = []
@@ -72,7 +72,7 @@ def run_comparison(
         progress(done, len(todo), f"{job.method}, {job.scene}, {job.trajectory}, seed {job.seed}, {job.seconds:g} s")
         records.append(_result(manifest, job, folder))
     progress(len(todo), len(todo), "")
-    # A comparison that was stopped may have gone on another day, and elsewhere.
+    # A stopped comparison may have been resumed on another day and machine.
     measured = [record.pop("measured") for record in records]
     when, where, torch_version = (", ".join(sorted({one[what] for one in measured})) for what in _measured())
     records += [_joined(manifest, other, folder) for other in manifest.others]
@@ -116,8 +116,8 @@ def _measured() -> dict[str, str]:
 
 
 def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
-    """The scene folder that a training gets, as simulated or as given, with the trajectory that it shall have; and what
-    that was made of."""
+    """The scene folder for a training, simulated or given, with the requested trajectory; and what defines it, for
+    hashing."""
     source = manifest.scenes[job.scene]
     if isinstance(source, Simulation):
         simulation = replace(source, seed=job.seed)
@@ -137,7 +137,7 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
         if true is not None:
             _check_bounds_are_of_reference(scene, true)
         with whole_folder(made) as temporary:
-            # Everything else stays where it is.
+            # All other files stay where they are.
             scene = replace(scene, folder=temporary, **stated)
             if true is not None and errors is not None:
                 trajectory = temporary / "trajectory.txt"
@@ -149,7 +149,7 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
 
 
 def _stated(source: Stated) -> dict[str, Any]:
-    """What is stated of a scene's sensor, by the names that scenes have for it."""
+    """Sensor facts given in the manifest, under the field names of :class:`Scene`."""
     facts = {name: getattr(source, name) for name in ("refractory_us", "time_constant_us")}
     if source.threshold_on is not None and source.threshold_off is not None:
         facts["contrast_threshold"] = ContrastThreshold(source.threshold_on, source.threshold_off)
@@ -157,7 +157,7 @@ def _stated(source: Stated) -> dict[str, Any]:
 
 
 def _contents(scene: Scene) -> object:
-    """What tells a scene from another one of its name; of large files, their sizes."""
+    """Identity of a scene's contents: small files in full, large ones by size."""
     small = (scene.folder / "scene.json", scene.trajectory, scene.groundtruth)
     large = (scene.events, *(frame.path for frame in scene.frames))
     return [path.read_bytes() for path in small if path], [path.stat().st_size for path in large if path.is_file()]
@@ -172,7 +172,7 @@ def _true_keyframes(scene: Scene) -> Trajectory:
 
 
 def _check_bounds_are_of_reference(scene: Scene, true: Trajectory) -> None:
-    """Bounds are of the world of the scene's own trajectory; others, made of the reference, must be in the same one."""
+    """Bounds are in the frame of the scene's own trajectory; trajectories made from the reference must share it."""
     if scene.bounds is None:
         return
     own = read_tum(scene.trajectory)
@@ -190,7 +190,7 @@ def _initial_errors(scene: Scene) -> dict[str, float | None]:
 
 
 def _joined(manifest: Manifest, other: Other, folder: Path) -> dict[str, Any]:
-    """What another program reached, from its files."""
+    """Results of another program, evaluated from its files."""
     job = Job(other.method, other.scene, other.trajectory, other.seed, float(other.seconds))
     folder_of_scene, _ = _scene(manifest, job, folder)
     scene = read_scene(folder_of_scene)

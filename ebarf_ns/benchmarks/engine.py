@@ -1,8 +1,8 @@
-"""How fast the engine is, measured side by side in one run, and how its cost grows with the work.
+"""Speed of the engine against baselines in the same run, and how its cost scales with the workload.
 
-What is ours needs only torch, numpy, numba and h5py, so that ``python -m ebarf_ns.benchmarks.engine`` also runs on a
-bare machine with a GPU (without scipy, poses are straight between keyframes, each of which moves alone); what it is
-compared with is measured where nerfstudio is importable, and left out where not.
+Our own measurements need only torch, numpy, numba and h5py, so that ``python -m ebarf_ns.benchmarks.engine`` also runs
+on a bare GPU machine (without scipy, poses are interpolated linearly and each keyframe moves alone). Baselines are
+measured if nerfstudio is importable, and skipped otherwise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from ebarf_ns.benchmarks.settings import PARTS, EngineBenchmark, Part
 from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
 from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.radiance.field import fastest_precision
-from ebarf_ns.radiance.hash_grid import HashGrid, encode_reference, fastest_carrier
+from ebarf_ns.radiance.hash_grid import HashGrid, encode_reference, fastest_backend
 from ebarf_ns.radiance.lattice import HashGridShape
 from ebarf_ns.radiance.ray_sampling import Rays
 
@@ -48,7 +48,7 @@ _ROUNDS = 3
 
 
 def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure everything asked for; returns what :func:`table` shows, ready for JSON."""
+    """Run the requested measurements; returns a JSON-ready result, which :func:`table` formats."""
     figures = []
     for part in settings.parts:
         say(f"measuring {part}")
@@ -58,7 +58,7 @@ def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] =
     return {
         "date": date.today().isoformat(),
         "machine": machine(),
-        "carrier": fastest_carrier(torch.zeros(0, 3, device=device())),
+        "backend": fastest_backend(torch.zeros(0, 3, device=device())),
         "precision": fastest_precision(device()),
         "versions": {"torch": torch.__version__, "numpy": np.__version__},
         "quick": settings.quick,
@@ -67,14 +67,14 @@ def run_engine_benchmark(settings: EngineBenchmark, say: Callable[[str], None] =
 
 
 class _Engine:
-    """One method for each part, which yields its figures as they come."""
+    """One method per part, each yielding figures as they are measured."""
 
     def __init__(self, settings: EngineBenchmark):
         self.quick, self.seeds, self.seconds = settings.quick, settings.seeds, settings.seconds
         self._repetitions = 2 if settings.quick else 9
 
     def hash_grid(self) -> Iterator[Figure]:
-        """Forward and backward with position gradients: the fastest carrier, the torch reference, nerfstudio's."""
+        """Forward and backward with position gradients: fastest backend, torch reference, nerfstudio's encoding."""
         count = 1_000 if self.quick else 100_000
         shape = HashGridShape(levels=16, features=2, coarsest=16, finest=1024, table_size_log2=19)
         grid = HashGrid(shape).to(device())
@@ -89,16 +89,16 @@ class _Engine:
             from ebarf_ns.nerf.comparison import hash_encoding
 
             theirs_encode, theirs_parameters = hash_encoding(shape, device())
-        # In turns: whatever else the machine does meets both.
+        # Alternate, so that other load on the machine affects both equally.
         rounds = []
         for _ in range(1 if self.quick else _ROUNDS):
             ours = self._both_ways(grid, point, list(grid.parameters()))
             theirs = self._both_ways(theirs_encode, point, theirs_parameters, few=True) if theirs_encode else math.nan
             rounds.append((ours, theirs, theirs / ours))
         ours, theirs, ratio = (median(column) for column in zip(*rounds, strict=True))
-        yield Figure(f"{name}, {fastest_carrier(point)}", 1e3 * ours, "ms")
+        yield Figure(f"{name}, {fastest_backend(point)}", 1e3 * ours, "ms")
         if device() == "cuda":
-            # Each corner is read, read again and added to; points and features come and go once.
+            # Each corner is read twice and accumulated; points and features are read and written once.
             moved = count * 16 * (8 * 2 * 4 * 4 + 2 * 2 * 4) + count * 3 * 4 * 3
             yield Figure(f"{name}, corner traffic at copy bandwidth", 1e3 * moved / _copy_bandwidth(), "ms")
         if theirs_encode:
@@ -115,20 +115,20 @@ class _Engine:
         return median_seconds(once, 3 if few else self._repetitions)
 
     def step(self) -> Iterator[Figure]:
-        """Training steps without nerfstudio around them, and the sampler beside them."""
+        """Training steps without nerfstudio, and the event sampler."""
         index = event_index(10_000 if self.quick else 1_000_000)
         for pairs in (512,) if device() == "cpu" or self.quick else (4096, 16384, 65536):
             step = Step(index, pairs)
             seconds = median_seconds(step.once, self._repetitions)
             yield Figure(f"step of {pairs:,} pairs", 1e3 * seconds, "ms")
             yield Figure(f"pairs per second, {pairs:,} a step", pairs / seconds, "pairs/s")
-            # As in training: threads of its own, one on a CPU and four beside a GPU.
+            # Background threads as in training: one on a CPU, four with a GPU.
             ahead, batches = DrawAhead(step.draw, ahead=1 if device() == "cpu" else 4), count()
             drawn = median_seconds(lambda take=ahead.batch, of=batches: take(next(of)), 20 * self._repetitions)
             yield Figure(f"sampler's speed over the step's, {pairs:,} pairs", seconds / drawn, "times", at_least=5)
 
     def scaling(self) -> Iterator[Figure]:
-        """Exponent of the seconds a step takes as one kind of work grows: 1 is linear, 0 is flat."""
+        """Scaling exponent of the step time in each workload parameter: 1 is linear, 0 is constant."""
         index = event_index(10_000 if self.quick else 1_000_000)
         sweeps: dict[str, tuple[list[int], Callable[[int], Step]]] = {
             "pairs per batch": ([256, 1024, 4096, 16384], lambda n: Step(index, n)),
@@ -148,7 +148,7 @@ class _Engine:
             yield Figure(f"growth with {name}", slope, "exponent", at_most=0.1 if flat else 1.05)
 
     def frame(self) -> Iterator[Figure]:
-        """A DAVIS346's frame."""
+        """Rendering a frame at DAVIS346 resolution."""
         width, height = (34, 26) if self.quick else (346, 260)
         frame_renderer = renderer(16, 8).eval()
         x, y = torch.meshgrid(torch.arange(width) / width - 0.5, torch.arange(height) / width - 0.4, indexing="xy")
@@ -163,7 +163,7 @@ class _Engine:
         yield Figure(f"a {width} x {height} frame", median_seconds(once, self._repetitions), "s", at_most=1.5)
 
     def simulator(self) -> Iterator[Figure]:
-        """A second of handheld motion before a DAVIS240C, from command to scene folder but for the imports."""
+        """Simulating a second of handheld motion at DAVIS240C resolution, without import time."""
         name = "simulating 1 s at 240 x 180"
         if not (find_spec("scipy") and find_spec("cv2")):
             yield Figure(name, None, "s")
@@ -173,14 +173,14 @@ class _Engine:
         small = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.2, frames=1)
         large = Simulation(width=240, height=180, focal_px=206.0, duration_s=1.0)
         with tempfile.TemporaryDirectory() as folder:
-            # Compiled before the clock starts.
+            # Compile before the clock starts.
             simulate(small, Path(folder) / "small")
             started = perf_counter()
             simulate(small if self.quick else large, Path(folder) / "large")
             yield Figure(name, perf_counter() - started, "s", at_most=20)
 
     def index(self) -> Iterator[Figure]:
-        """An index of many events from a file, in memory and in a file of its own."""
+        """Indexing many events from a file, in memory and in a temporary file."""
         events = 100_000 if self.quick else 100_000_000
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "events.h5"
@@ -196,7 +196,7 @@ class _Engine:
                 yield Figure(f"{name}: a batch of 512 pairs", made["batch_ms"], "ms")
 
     def nerfacto(self) -> Iterator[Figure]:
-        """Training rays per second of our default method, and of stock nerfacto in torch."""
+        """Training rays per second of our default method and of stock nerfacto in torch."""
         if not find_spec("nerfstudio"):
             yield Figure("training rays per second against nerfacto", None, "times")
             return
@@ -214,7 +214,7 @@ class _Engine:
             yield Figure(f"ebarf against {name}", ours / theirs, "times", at_least=target)
 
     def training(self) -> Iterator[Figure]:
-        """Trainings on the demo scene: how soon they are within 1 dB of where they end, and what memory they take."""
+        """Trainings on the demo scene: time until within 1 dB of the final PSNR, and peak memory."""
         if not find_spec("nerfstudio"):
             yield Figure("time until within 1 dB of the final PSNR", None, "s")
             return
@@ -238,7 +238,7 @@ class _Engine:
 
 
 def _copy_bandwidth() -> float:
-    """Bytes read and written a second by a copy within the GPU's memory."""
+    """Bytes read and written per second by a copy in GPU memory."""
     source = torch.empty(1 << 28, device="cuda")
     target = torch.empty_like(source)
     return 2 * source.numel() * 4 / median_seconds(lambda: target.copy_(source), 9)
@@ -256,7 +256,8 @@ def _write_events(path: Path, events: int) -> None:
 
 
 def _in_own_process(*words: str) -> Any:
-    """What this module prints last when called with these words: memory and nerfstudio's writers are a process's."""
+    """Run this module with arguments in a subprocess and parse its last line: peak memory and nerfstudio's writers are
+    global to a process."""
     command = [sys.executable, "-m", "ebarf_ns.benchmarks.engine", *words]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
@@ -266,7 +267,7 @@ def _measure_index(path: Path, memory_gib: float) -> dict[str, float]:
     from ebarf_ns.memory import peak_memory_mib
 
     file = RecordingFile(path, WIDTH, HEIGHT)
-    # Compiled before the clock starts.
+    # Compile before the clock starts.
     index_pairs(lambda: [file.window(0, 20_000)], WIDTH, HEIGHT)
     started = perf_counter()
     index = index_pairs(file.chunks, WIDTH, HEIGHT, int(memory_gib * 2**30))
@@ -286,7 +287,7 @@ def _demo_scene(folder: Path, seed: int, quick: bool) -> Path:
 
 
 def main(words: list[str]) -> None:
-    """``python -m ebarf_ns.benchmarks.engine [PART ...]``: for machines without the rest of the project."""
+    """``python -m ebarf_ns.benchmarks.engine [PART ...]``, for machines without the full dependencies."""
     if words[:1] == ["index"] and len(words) == 3:
         print(json.dumps(_measure_index(Path(words[1]), float(words[2]))))
         return

@@ -1,4 +1,4 @@
-"""One training step and its events, of the core rooms alone, to be timed."""
+"""One training step and its events, built from the core packages only, for timing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WIDTH, HEIGHT, FOCAL_PX = 128, 96, 110.0
 
 
 class Step:
-    """One training step from events to updated field and poses, of the core rooms alone."""
+    """One training step from events to updated field and poses, built from the core packages only."""
 
     def __init__(self, index: PairIndex, pairs: int = 512, samples: int = 16, levels: int = 8, keyframes: int = 41):
         torch.manual_seed(0)
@@ -52,11 +52,11 @@ class Step:
         self.number = 0
 
     def draw(self, batch: int) -> Any:
-        """Event pairs, as in training."""
+        """Draw event pairs as in training."""
         return self.index.draw_accepted(self.pairs, 30, batch_random(0, batch), self.heldout.training)
 
     def once(self) -> None:
-        """Event pairs, poses, rays, intensities, difference, loss, gradients, update."""
+        """Run one step: event pairs, poses, rays, intensities, difference, loss, gradients, update."""
         self.renderer.begin_step(self.number, self.random)
         drawn = self.draw(self.number)
         t_us = torch.from_numpy(np.r_[drawn.t0_us, drawn.t1_us]).to(device())
@@ -84,12 +84,12 @@ def renderer(samples: int, levels: int) -> Renderer:
 
 
 def device() -> str:
-    """The GPU where there is one."""
+    """cuda if available, else cpu."""
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def median_seconds(once: Callable[[], object], repetitions: int) -> float:
-    """Median time after two calls to warm up."""
+    """Median time of a call after two warm-up calls."""
     times = []
     for _ in range(repetitions + 2):
         started = perf_counter()
@@ -101,7 +101,7 @@ def median_seconds(once: Callable[[], object], repetitions: int) -> float:
 
 
 def some_events(begin: int, count: int, total: int) -> Recording:
-    """Events ``begin`` to ``begin + count`` of a recording of 2 s in which every pixel takes part."""
+    """Events ``begin`` to ``begin + count`` of a 2 s recording with events at random pixels."""
     random = np.random.default_rng(begin)
     t_us = (np.arange(begin, begin + count) * (2_000_000 / total)).astype(np.int64)
     columns = (random.integers(0, WIDTH, count, np.uint16), random.integers(0, HEIGHT, count, np.uint16))
@@ -109,11 +109,11 @@ def some_events(begin: int, count: int, total: int) -> Recording:
 
 
 def event_chunks(total: int) -> Iterator[Recording]:
-    """So many events, a piece at a time."""
+    """Yield ``total`` events in chunks."""
     size = 1 << 22
     return (some_events(begin, min(size, total - begin), total) for begin in range(0, total, size))
 
 
 def event_index(events: int) -> PairIndex:
-    """An index of so many events."""
+    """An index of the given number of events."""
     return index_pairs(lambda: event_chunks(events), WIDTH, HEIGHT)

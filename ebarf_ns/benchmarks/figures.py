@@ -1,4 +1,4 @@
-"""Measured figures beside their targets."""
+"""Measured figures and their targets."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ebarf_ns.files import whole_file
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured number and, where there is one, what it should reach."""
+    """One measured number and, optionally, its target."""
 
     what: str
     value: float | None
@@ -28,7 +28,7 @@ class Figure:
 
     @property
     def verdict(self) -> str:
-        """Whether the target is met; empty where there is none."""
+        """Whether the target is met; empty without a target."""
         if self.value is None:
             return "not measured"
         if self.at_least is not None:
@@ -39,14 +39,14 @@ class Figure:
 
     @property
     def target(self) -> str:
-        """For a person."""
+        """The target as text."""
         if self.at_least is not None:
             return f">= {self.at_least:g}"
         return f"<= {self.at_most:g}" if self.at_most is not None else ""
 
 
 def machine() -> str:
-    """Processor or GPU, for people."""
+    """Human-readable name of the GPU or processor."""
     if torch.cuda.is_available():
         return f"one {torch.cuda.get_device_name()}"
     name = platform.processor() or platform.machine()
@@ -57,14 +57,14 @@ def machine() -> str:
 
 
 def shown(value: float | None) -> str:
-    """A figure for people."""
+    """Format a figure for display."""
     if value is None or not math.isfinite(value):
         return "-"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def table(result: dict[str, Any]) -> str:
-    """The figures, as Markdown."""
+    """The figures as a Markdown table."""
     lines = [f"{result['machine']}, {result['date']}", "", "| what | measured | target | |", "|---|---|---|---|"]
     for one in result["figures"]:
         figure = Figure(**{name: value for name, value in one.items() if name != "verdict"})
@@ -73,6 +73,6 @@ def table(result: dict[str, Any]) -> str:
 
 
 def write(result: dict[str, Any], path: Path) -> None:
-    """Keep the figures as JSON."""
+    """Write the figures as JSON."""
     with whole_file(path) as temporary:
         temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a comparison consists of: methods x scenes x trajectories x seeds x seconds, read from a YAML file."""
+"""Definition of a comparison: methods x scenes x trajectories x seeds x seconds, read from a YAML file."""
 
 import math
 import re
@@ -19,27 +19,27 @@ from ebarf_ns.simulation.trajectory_errors import NO_ERRORS, TrajectoryErrors
 Role = Literal["method", "floor", "ceiling"]
 T = TypeVar("T")
 TRUE = "true"
-"""The trajectory that floors get."""
+"""The trajectory used for floors."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """Something that is trained."""
+    """A method to train."""
 
     command: str
-    """What follows ns-train: a method and its flags."""
+    """Arguments of ns-train: a method and its flags."""
     role: Role = "method"
-    """floor: gets the true poses, whatever the trajectory; ceiling: leaves the poses as they are given."""
+    """floor: trained with the true poses, whatever the trajectory; ceiling: keeps the given poses fixed."""
 
     @property
     def words(self) -> list[str]:
-        """As a shell would split the command."""
+        """The command, split as by a shell."""
         return shlex.split(self.command)
 
 
 @dataclass(frozen=True)
 class Stated:
-    """A scene folder, with facts of its sensor stated that its scene.json may not state."""
+    """A scene folder with sensor properties that override its scene.json."""
 
     folder: Path
     threshold_on: float | None = None
@@ -50,7 +50,7 @@ class Stated:
 
 @dataclass(frozen=True)
 class Other:
-    """What another program made of a scene: it joins by its files."""
+    """Result of another program on a scene, given by its output files."""
 
     method: str
     scene: str
@@ -58,9 +58,9 @@ class Other:
     seed: int
     seconds: float
     refined: Path
-    """Its trajectory, a TUM file in any similarity of the world."""
+    """Refined trajectory, a TUM file up to a similarity of the world."""
     renders: Path | None = None
-    """Its pictures of the scene's frames: files of the same names."""
+    """Folder with renders of the scene's frames, under the same file names."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,14 @@ class Manifest:
 
     methods: dict[str, Method]
     scenes: dict[str, Simulation | Stated]
-    """What to simulate, for each seed anew, or a scene folder; without a reference trajectory, it has no floor."""
+    """A simulation, repeated for each seed, or a scene folder; without a reference trajectory, it has no floor."""
     trajectories: dict[str, TrajectoryErrors | None]
-    """What is wrong with the initial trajectory; None: the scene folder's own."""
+    """Errors of the initial trajectory; None: the scene folder's own trajectory."""
     seeds: tuple[int, ...] = (0, 1, 2)
     seconds: tuple[float, ...] = (60.0,)
     """Training times."""
     evaluations: int = 6
-    """Of each training."""
+    """Number of evaluations per training."""
     others: tuple[Other, ...] = ()
     name: str = ""
 
@@ -132,7 +132,7 @@ class _Reader:
         if not found:
             raise self.wrong(key, found, "one entry or more")
         for name in found:
-            # Names become those of files.
+            # Names become file names.
             if not re.fullmatch(r"[\w .,+-]+", name) or name.startswith(".") or name == TRUE:
                 raise self.wrong(f"a name in {key}", name, f"letters, digits, spaces and . , + - _, and not {TRUE!r}")
         return list(found.items())
@@ -204,7 +204,7 @@ class _Reader:
 
 
 def _fits(value: object, kind: Any) -> bool:
-    """Whether a value from YAML is of an annotated type."""
+    """Whether a YAML value matches an annotated type."""
     if get_origin(kind) in (Union, UnionType):
         return any(_fits(value, one) for one in get_args(kind))
     if get_origin(kind) is Literal:

@@ -1,4 +1,4 @@
-"""How fast recordings become scenes, beside what other libraries take to read them, and in how much memory."""
+"""Speed and memory of converting recordings to scenes, against the reading speed of other libraries."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PIECE = 1 << 20
 def run_recordings_benchmark(
     settings: RecordingsBenchmark, say: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Write a file of each format, read it into a scene, and time both that and the plainest way of reading it."""
+    """Write a file in each format, convert it to a scene, and time that and the simplest way of reading the file."""
     figures = []
     with tempfile.TemporaryDirectory() as folder:
         for figure in _figures(settings, Path(folder)):
@@ -47,7 +47,7 @@ def _figures(settings: RecordingsBenchmark, folder: Path) -> Iterator[Figure]:
         count = settings.events if name == "hdf5" else settings.events // 10
         path = _WRITERS[name](folder, count)
         _settle()
-        ours = _usual_seconds(path, folder / "out.h5", 5)
+        ours = _median_seconds(path, folder / "out.h5", 5)
         yield Figure(f"{name}, {count:,} events into a scene", count / ours / 1e6, "M events/s", at_least=target)
         for library, read in _PLAIN.get(name, {}).items():
             yield Figure(f"{name}, the same by {library}", count / _seconds(read, path) / 1e6, "M events/s")
@@ -64,15 +64,15 @@ def _figures(settings: RecordingsBenchmark, folder: Path) -> Iterator[Figure]:
 
 
 def _settle() -> None:
-    """A recording lies on the disk when it is read: what was just written must not be in the way of what is timed."""
+    """Flush pending writes to disk, so that they do not disturb the timing."""
     if hasattr(os, "sync"):
         os.sync()
 
 
-def _usual_seconds(path: Path, output: Path, repetitions: int) -> float:
-    """Median, after a first time in which kernels are compiled and memory is got from the system."""
-    _taken(path, output)
-    return statistics.median(_seconds(_taken, path, output) for _ in range(repetitions))
+def _median_seconds(path: Path, output: Path, repetitions: int) -> float:
+    """Median time after a warm-up run, which compiles kernels and allocates memory."""
+    _convert(path, output)
+    return statistics.median(_seconds(_convert, path, output) for _ in range(repetitions))
 
 
 def _seconds(call: Callable[..., object], *arguments: object) -> float:
@@ -81,19 +81,19 @@ def _seconds(call: Callable[..., object], *arguments: object) -> float:
     return perf_counter() - started
 
 
-def _taken(path: Path, output: Path) -> None:
+def _convert(path: Path, output: Path) -> None:
     take_in(open_recording(path), SIZE, Intake(), output)
 
 
 def _columns(first: int, count: int) -> tuple[np.ndarray, ...]:
-    """Ten million events a second, in bursts of one microsecond."""
+    """Ten million events per second, ten in each microsecond."""
     random = np.random.default_rng(first)
     x, y = random.integers(0, SIZE[0], count), random.integers(0, SIZE[1], count)
     return (np.arange(first, first + count) // 10, x, y, random.integers(0, 2, count))
 
 
 def write_hdf5(folder: Path, count: int) -> Path:
-    """As TUM-VIE and DSEC have it."""
+    """HDF5 in the layout of TUM-VIE and DSEC."""
     path = folder / "events.h5"
     with h5py.File(path, "w") as file:
         made = {
@@ -107,7 +107,7 @@ def write_hdf5(folder: Path, count: int) -> Path:
 
 
 def _write_evt3(folder: Path, count: int) -> Path:
-    """Time and row before every event, as between scattered ones."""
+    """EVT3 with time and row words before every event, as for scattered events."""
     path = folder / "events.raw"
     with path.open("wb") as file:
         file.write(b"% evt 3.0\n% geometry 640x480\n% end\n")
@@ -119,14 +119,14 @@ def _write_evt3(folder: Path, count: int) -> Path:
 
 
 def aedat4(pieces: Iterable[tuple[np.ndarray, ...]], size: tuple[int, int] = SIZE) -> Iterator[bytes]:
-    """An AEDAT4 file without compression, of pieces of t [us], x, y and polarity: a header and a packet for each."""
+    """An uncompressed AEDAT4 file from chunks of t [us], x, y and polarity: a header and one packet per chunk."""
     description = (
         '<dv version="2.0"><node name="outInfo" path="/"><node name="0" path="/0/">'
         '<attr key="compression" type="string">NONE</attr><attr key="typeIdentifier" type="string">EVTS</attr>'
         f'<node name="info" path="/0/info/"><attr key="sizeX" type="int">{size[0]}</attr>'
         f'<attr key="sizeY" type="int">{size[1]}</attr></node></node></node></dv>'
     ).encode()
-    # Flatbuffers: where the root is, the kind, and a table: compression, where the packets end (not said), description.
+    # Flatbuffers: root offset, identifier, and a table of compression, end of the packets (not given) and description.
     table = struct.pack("<5Hi2Iq", 10, 20, 4, 12, 8, 10, 0, 12, -1)
     header = struct.pack("<I4s6x", 24, b"IOHE") + table + struct.pack("<I", len(description)) + description + b"\0"
     yield b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header
@@ -147,7 +147,7 @@ def _write_aedat4(folder: Path, count: int) -> Path:
 
 
 def _write_bag(folder: Path, count: int) -> Path:
-    """A ROS 1 bag of dvs_msgs/EventArray."""
+    """A ROS 1 bag with dvs_msgs/EventArray messages."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -213,5 +213,5 @@ _PLAIN: dict[str, dict[str, Callable[[Path], None]]] = {
 
 
 if __name__ == "__main__":
-    seconds = _usual_seconds(Path(sys.argv[1]), Path(sys.argv[2]), 3)
+    seconds = _median_seconds(Path(sys.argv[1]), Path(sys.argv[2]), 3)
     print(json.dumps({"seconds": seconds, "peak_memory_mib": peak_memory_mib()}))

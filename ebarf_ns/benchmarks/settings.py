@@ -1,31 +1,31 @@
-"""What the benchmarks can be asked for; light, for the command line."""
+"""Benchmark settings; imports little, so that the command line starts fast."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-# Those that fill the memory come last.
+# Parts that fill the memory come last.
 Part = Literal["hash_grid", "step", "nerfacto", "frame", "simulator", "training", "scaling", "index"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 
 @dataclass(frozen=True)
 class EngineBenchmark:
-    """What to measure and how thoroughly."""
+    """Settings of the engine benchmark."""
 
     parts: tuple[Part, ...] = PARTS
     quick: bool = False
-    """Small sizes and few repetitions: whether it runs, not how fast."""
+    """Small sizes and few repetitions, to check that it runs, not how fast."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the trainings on the demo scene."""
+    """Seeds of the trainings on the demo scene."""
     seconds: float = 100.0
-    """Training time of each."""
+    """Training time per seed."""
 
 
 @dataclass(frozen=True)
 class RecordingsBenchmark:
-    """How much to write and read."""
+    """Settings of the recordings benchmark."""
 
     events: int = 20_000_000
-    """Of the HDF5 file; of the other formats, a tenth."""
+    """Events in the HDF5 file; other formats get a tenth."""
     huge: int = 200_000_000
-    """Events of the file by which memory is measured; 0: none."""
+    """Events in the file used to measure memory; 0: skip."""

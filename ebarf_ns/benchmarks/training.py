@@ -1,4 +1,4 @@
-"""One training as a user would run it, in a process of its own."""
+"""One training as a user would run it, in a subprocess."""
 
 import json
 import subprocess
@@ -13,9 +13,9 @@ from ebarf_ns.errors import BenchmarkError
 def train(
     words: Sequence[str], scene: Path, run: Path, seed: int, seconds: float, evaluations: int
 ) -> list[dict[str, Any]]:
-    """The evaluations of ``ns-train`` with the given method and flags; the run is left in the folder ``run``.
+    """Run ``ns-train`` with the given method and flags in the folder ``run`` and return its evaluations.
 
-    Raises :class:`BenchmarkError` with the last line that a failing training says.
+    Raises :class:`BenchmarkError` with the last line of output if the training fails.
     """
     method, *flags = words
     command = [

@@ -15,6 +15,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.cli.estimate_command import TrajectoryEstimate
+from ebarf_ns.cli.replay import Replay
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
 from ebarf_ns.formats.process import Format, ProcessSettings
 from ebarf_ns.formats.source import TimeUnit
@@ -343,6 +344,7 @@ def entrypoint() -> None:
                 "trajectory": Trajectory,
                 "evaluate": Evaluate,
                 "bench": Bench,
+                "replay": Replay,
             },
             description=__doc__,
             args=_with_config(sys.argv[1:]),

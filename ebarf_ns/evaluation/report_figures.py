@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from ebarf_ns.evaluation.trajectory_error import aligned_positions, errors_over_time
+from ebarf_ns.files import read_picture
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 
 if TYPE_CHECKING:
@@ -197,7 +198,7 @@ def _correlation(recorded: np.ndarray, predicted: np.ndarray) -> float:
 def with_error_map(path: Path) -> tuple[bytes, float]:
     """A picture of render and reference side by side, as a PNG with the error between them as a third, and PSNR in dB
     as it is shown."""
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    grey = read_picture(path, cv2.IMREAD_GRAYSCALE)
     assert grey is not None
     render, reference = np.split(grey, 2, axis=1)
     difference = render.astype(float) - reference

@@ -1,1 +1,1 @@
-"""Recordings, their sensor, and pairs of events."""
+"""Recordings, estimates of their sensor's properties, and event pairs."""

@@ -1,4 +1,4 @@
-"""Which pairs of events a batch is made of: held-out windows, random numbers, drawing ahead."""
+"""Batches of event pairs: held-out time windows, per-batch random numbers, prefetching."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ class HeldoutBlocks:
     blocks: int = 20
 
     def contain(self, t_us: Int64[np.ndarray, "*batch"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether each time lies in one of the windows."""
+        """Whether each time lies in a window."""
         phase = (t_us - self.start_us) / max(self.end_us - self.start_us, 1) * self.blocks % 1
         return np.abs(phase - 0.5) < self.share / 2
 
     def middle_s(self, number: int) -> float:
-        """The middle of a window, in seconds."""
+        """Centre of a window, in seconds."""
         return round((self.start_us + (number + 0.5) * (self.end_us - self.start_us) / self.blocks) * 1e-6, 3)
 
     def number(self, t_us: Int64[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
-        """In or nearest to which window each time lies."""
+        """Index of the window that contains each time or is nearest to it."""
         return ((t_us - self.start_us) * self.blocks // max(self.end_us - self.start_us, 1)).clip(0, self.blocks - 1)
 
     def training(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
-        """Pairs that begin and end outside; their sums count the events in between all the same."""
+        """Pairs that begin and end outside the windows; their sums still include the events in between."""
         return ~(self.contain(pairs.t0_us) | self.contain(pairs.t1_us))
 
     def heldout(self, pairs: EventPairs) -> Bool[np.ndarray, "pairs"]:
-        """Pairs that end inside."""
+        """Pairs that end in a window."""
         return self.contain(pairs.t1_us)
 
 
 class DrawAhead:
-    """Draws the next ``ahead`` batches, numbered ``stride`` apart, in threads of its own while one is used."""
+    """Prefetches the next ``ahead`` batches, numbered ``stride`` apart, in background threads."""
 
     def __init__(self, draw: Callable[[int], EventPairs], stride: int = 1, ahead: int = 1):
         self._draw, self._stride, self._ahead = draw, stride, ahead
@@ -55,12 +55,12 @@ class DrawAhead:
         self._drawn: dict[int, Future[EventPairs]] = {}
 
     def batch(self, number: int) -> EventPairs:
-        """Batch ``number``, waited for where it was not one of those expected."""
+        """Return batch ``number``; an unexpected number is drawn on demand."""
         wanted = [number + k * self._stride for k in range(self._ahead + 1)]
         self._drawn = {k: self._drawn.get(k) or self._workers.submit(self._draw, k) for k in wanted}
         return self._drawn.pop(number).result()
 
 
 def batch_random(seed: int, batch: int) -> np.random.Generator:
-    """The random numbers of batch number ``batch`` of ``seed``: counter-based, so that no batch depends on another."""
+    """Counter-based random generator for batch number ``batch`` of ``seed``, so that batches are independent."""
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, batch]))

@@ -1,4 +1,4 @@
-"""Events ordered by pixel and time, in memory or in a temporary file."""
+"""Events sorted by pixel and time, in memory or in a temporary file."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.pairs import EVENT, PairIndex, counting
 from ebarf_ns.events.pixels import dead_pixels, hot_pixels
@@ -26,12 +26,12 @@ def index_pairs(
     memory_bytes: int = 1 << 62,
     doubles_us: int = 0,
 ) -> PairIndex:
-    """Order events by pixel and time; ``chunks`` gives them in order of time, and is asked twice or more.
+    """Sort events by pixel and time; ``chunks`` yields them in time order and is called at least twice.
 
-    Events that repeat the one before within ``doubles_us`` at their pixel, with its polarity, are left out.
+    An event that repeats the previous one at its pixel, with the same polarity and within ``doubles_us``, is dropped.
 
-    An index beyond ``memory_bytes`` lives in a temporary file, and is made a part of the sensor at a time, with one
-    more pass through the events for each part. Raises :class:`RecordingError` when no pixel has two events.
+    An index larger than ``memory_bytes`` is stored in a temporary file and built one part of the sensor at a time; each
+    part takes another pass over the events. Raises :class:`RecordingError` when no pixel has two events.
     """
     pixels = width * height
     counts = np.zeros(pixels, np.int64)
@@ -63,7 +63,7 @@ def index_pairs(
 
 @njit(cache=True)
 def _drop_doubles(events, first, doubles_us):
-    """Close the gaps that they leave, in place; returns where each pixel's events begin then."""
+    """Remove double events in place; returns the new start index of each pixel."""
     kept, new_first = 0, np.zeros_like(first)
     for pixel in range(len(first) - 1):
         dropped, before, sum_before, last_us = 0, 0, 0, 0
@@ -81,11 +81,11 @@ def _drop_doubles(events, first, doubles_us):
 
 
 def _file_backed(count: int) -> np.ndarray:
-    # Without a name: the space is free again when the process ends, however it ends.
+    # An unnamed file is freed when the process ends, even if it crashes.
     size = count * EVENT.itemsize
     try:
         file = tempfile.TemporaryFile()
-        # All of it now: a disk that turns out full when a mapped page is written ends the process without a word.
+        # Allocate everything now: a full disk during a write to a mapped page would kill the process silently.
         os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
         return np.memmap(file, EVENT, "r+", shape=(count,))
     except OSError as error:
@@ -97,7 +97,7 @@ def _file_backed(count: int) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def _place(pixel, t_us, polarity, begin, free, sums, part):
-    """Counting sort: each event of the pixels from ``begin`` on goes to its pixel's next free place."""
+    """Counting sort: each event of the pixels from ``begin`` on goes to its pixel's next free slot."""
     for i in range(len(pixel)):
         p = pixel[i] - begin
         if 0 <= p < len(free):

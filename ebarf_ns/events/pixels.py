@@ -1,7 +1,7 @@
-"""Pixels that are broken, told from their neighbours: those that fire without a cause, and those that never do.
+"""Hot and dead pixels, found by comparing each pixel with its neighbours.
 
-What moves across the sensor passes over neighbouring pixels alike, so that a pixel which has several times the events
-of those around it is hot however busy the rest of the sensor is, and one without events amid busy ones is dead.
+Moving edges pass over neighbouring pixels alike. So a pixel with several times the events of its neighbours is hot,
+however busy the rest of the sensor is, and one without events among active ones is dead.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _BUSY, _LEAST_ACTIVE = 5, 0.2
 
 
 def hot_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarray, "pixels"]:
-    """Pixels with over 3 times the events of the second busiest of the 24 around them, and 20 more.
+    """Pixels with more than 3 times the events of the second busiest of their 24 neighbours, plus 20.
 
-    The second, so that a pair of hot pixels does not excuse each other. An edge that runs along a row of pixels has
-    busy neighbours in that row.
+    The second busiest, so that two adjacent hot pixels do not hide each other. An edge along a row of pixels has busy
+    neighbours in that row.
     """
     if len(counts) < 3:
         return np.zeros(len(counts), bool)
@@ -30,10 +30,10 @@ def hot_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarr
 
 
 def dead_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndarray, "pixels"]:
-    """Pixels without any event, in the middle of pixels with 5 or more, or in a block of columns or rows that is dead.
+    """Pixels without events, surrounded by pixels with 5 or more, or in a dead block of columns or rows.
 
-    Some sensors lack event pixels along a border. Such a block ends at a line that is as busy as others, all along. A
-    wall or a sky that no event comes from does not end like that.
+    Some sensors lack event pixels along a border. Such a block ends at a line that is as active as the others over its
+    whole length. A blank wall or sky does not.
     """
     silent = counts == 0
     alone = silent & (-_second_busiest(-counts, width) >= _BUSY)
@@ -43,7 +43,7 @@ def dead_pixels(counts: Int64[np.ndarray, "pixels"], width: int) -> Bool[np.ndar
 
 
 def _dead_lines(active_share: np.ndarray) -> np.ndarray:
-    """Which lines of pixels are silent up to a border, and end at one that is more than half as active as usual."""
+    """Lines of silent pixels between a border and a line more than half as active as usual."""
     found = np.zeros(len(active_share), bool)
     somewhere = np.nonzero(active_share)[0]
     if not len(somewhere):
@@ -60,7 +60,7 @@ def _dead_lines(active_share: np.ndarray) -> np.ndarray:
 
 
 def _second_busiest(counts: np.ndarray, width: int) -> np.ndarray:
-    """The second largest count among the neighbours of each pixel; those beyond a border are its mirror image."""
+    """The second largest count among the neighbours of each pixel, with mirrored borders."""
     picture = counts.reshape(-1, width)
     reach = [min(_REACH, side - 1) for side in picture.shape]
     padded = np.pad(picture, [(side, side) for side in reach], mode="reflect")

@@ -1,4 +1,4 @@
-"""The recording: event columns with int64 microseconds, read from HDF5 in pieces with every value checked."""
+"""The recording: event columns with int64 microseconds, read from HDF5 in chunks with every value checked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.files import whole_file
+from ebarf_ns.files import is_special, whole_file
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int8, Int64, UInt8, UInt16
@@ -29,7 +29,7 @@ _CHUNK = 1 << 17
 
 @dataclass(frozen=True)
 class Recording:
-    """Events in non-decreasing time; ``x`` is the column and ``y`` the row, origin top left."""
+    """Events in non-decreasing time order; ``x`` is the column and ``y`` the row, origin at the top left."""
 
     x: UInt16[np.ndarray, "events"]
     y: UInt16[np.ndarray, "events"]
@@ -41,11 +41,11 @@ class Recording:
         return len(self.t_us)
 
     def select(self, which: slice | Bool[np.ndarray, "events"]) -> Recording:
-        """The events at a slice or mask."""
+        """The events selected by a slice or mask."""
         return Recording(self.x[which], self.y[which], self.t_us[which], self.polarity[which])
 
     def between(self, start_us: int, end_us: int) -> Recording:
-        """The events from ``start_us`` to ``end_us``, both included."""
+        """The events from ``start_us`` to ``end_us``, inclusive."""
         first, last = np.searchsorted(self.t_us, [start_us, end_us + 1])
         return self.select(slice(first, last))
 
@@ -56,10 +56,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordingFile:
-    """An HDF5 file in the layout of TUM-VIE or DSEC, ``/events/{x,y,t,p}`` and ``/t_offset``, of any size.
+    """An HDF5 file of any size in the layout of TUM-VIE or DSEC, ``/events/{x,y,t,p}`` and ``/t_offset``.
 
-    Nothing is repaired or dropped: whatever reads from it raises :class:`RecordingError` naming file, column, row,
-    value and expectation for anything that does not fit a ``width`` x ``height`` sensor.
+    Nothing is repaired or dropped: every read raises :class:`RecordingError`, naming file, column, row, value and
+    expectation, for data that does not fit a ``width`` x ``height`` sensor.
     """
 
     path: Path
@@ -67,7 +67,7 @@ class RecordingFile:
     height: int
 
     def span(self) -> tuple[int, int, int]:
-        """Number of events, and times of the first and last one in microseconds; between them, nothing is looked at."""
+        """Number of events, and times of the first and last one in microseconds; only these two are read."""
         with self._columns() as (columns, t_offset_us):
             count = len(columns["t"])
             first = next(self._pieces(columns, t_offset_us, 0, 1, 1))
@@ -81,7 +81,7 @@ class RecordingFile:
             yield from self._pieces(columns, t_offset_us, 0, len(columns["t"]), size)
 
     def window(self, start_us: int, end_us: int) -> Recording:
-        """The events from ``start_us`` to ``end_us``, both included, found by bisection; the rest is not looked at."""
+        """The events from ``start_us`` to ``end_us``, inclusive, found by bisection; the rest is not read."""
         with self._columns() as (columns, t_offset_us):
             t = columns["t"]
             first, last = bisect_left(t, start_us - t_offset_us), bisect_right(t, end_us - t_offset_us)
@@ -111,6 +111,8 @@ class RecordingFile:
     @contextmanager
     def _columns(self) -> Iterator[tuple[dict[str, h5py.Dataset], int]]:
         path = self.path
+        if is_special(path):
+            raise RecordingError(f"{path}: a pipe or a device, expected a file")
         try:
             with h5py.File(path, "r") as file:
                 columns = {name: self._column(file, name) for name in ("x", "y", "t", "p")}
@@ -139,7 +141,7 @@ class RecordingFile:
         return dataset
 
     def _check(self, piece: dict[str, np.ndarray], begin: int, before: int | None) -> None:
-        """``begin`` is the row of the piece's first event, ``before`` the time of the event above it."""
+        """``begin`` is the row of the piece's first event, ``before`` the time of the previous event."""
         x, y, t, p = (piece[name].view(np.uint8) if piece[name].dtype == bool else piece[name] for name in "xytp")
         t_us = t.astype(np.int64)
         late = np.r_[before is not None and bool(t_us[0] < before), t_us[1:] < t_us[:-1]]
@@ -160,14 +162,14 @@ class RecordingFile:
 
 
 def read_recording(path: Path, width: int, height: int) -> Recording:
-    """All of a :class:`RecordingFile` in one piece."""
+    """Read a whole :class:`RecordingFile` into memory."""
     return joined(RecordingFile(path, width, height).chunks())
 
 
 def joined(pieces: Iterable[Recording]) -> Recording:
-    """Pieces that follow each other as one recording."""
-    nothing = Recording(np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.int64), np.zeros(0, np.int8))
-    parts = list(pieces) or [nothing]
+    """Concatenate consecutive pieces into one recording."""
+    empty = Recording(np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.int64), np.zeros(0, np.int8))
+    parts = list(pieces) or [empty]
     columns = ("x", "y", "t_us", "polarity")
     return Recording(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
@@ -175,8 +177,8 @@ def joined(pieces: Iterable[Recording]) -> Recording:
 def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None = None) -> None:
     """Write the layout that :class:`RecordingFile` reads, with ``/ms_to_idx`` and the first millisecond as offset.
 
-    Takes the events piece by piece, in order of time. Raises :class:`RecordingError`, which names ``source`` where it
-    is given, for no events and for a span beyond 6 days.
+    The pieces must be in time order. Raises :class:`RecordingError`, which names ``source`` if given, for no events and
+    for a span over 6 days.
     """
     count = offset_us = begun_ms = 0
     columns: dict[str, h5py.Dataset] = {}
@@ -192,7 +194,7 @@ def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None
                 raise RecordingError(
                     f"{source or path}: the events span {t_us[-1]} us, expected less than {_MAX_SPAN_US}"
                 )
-            # The milliseconds that begin after the last event before this piece, up to its own last one.
+            # The milliseconds that begin after the previous piece's last event and up to this piece's last one.
             until_ms = int(t_us[-1]) // 1000 + 1
             for first_ms in range(begun_ms, until_ms, _CHUNK):
                 milliseconds = np.arange(first_ms, min(first_ms + _CHUNK, until_ms))
@@ -213,7 +215,7 @@ def _columns(file: h5py.File) -> dict[str, h5py.Dataset]:
         name: file.create_dataset(f"events/{name}", dtype=dtype, **growing)
         for name, dtype in (("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1"))
     }
-    # Long silences make long runs of one number.
+    # Long silences repeat one number, which compresses well.
     index = file.create_dataset("ms_to_idx", dtype="<u8", compression="gzip", compression_opts=1, **growing)
     return {**columns, "ms_to_idx": index}
 
@@ -224,7 +226,7 @@ def _append(column: h5py.Dataset, values: np.ndarray) -> None:
 
 
 def accumulate(recording: Recording, width: int, height: int) -> UInt8[np.ndarray, "height width"]:
-    """A grey picture of the events: mid-grey where there are none, brighter or darker by the polarities' sum."""
+    """Render events as a grey image: mid-grey where there are none, brighter or darker by the polarity sum."""
     picture = np.zeros(width * height, np.int64)
     np.add.at(picture, recording.pixels(width), recording.polarity)
     return (128 + np.clip(32 * picture, -128, 127)).astype(np.uint8).reshape(height, width)

@@ -1,7 +1,7 @@
-"""What a recording tells of the sensor that made it: how long its pixels are blind, and how its thresholds compare.
+"""Sensor properties estimated from a recording: the refractory period and the ratio of the contrast thresholds.
 
-Every fact is an estimate with a range. Both are read from times and polarities alone, before anything is trained; what
-the scene or a flag states goes before them.
+Every property is an estimate with a range. Both are computed from times and polarities alone, before any training;
+values given by the scene or a flag take precedence.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.indexing import index_pairs
 from ebarf_ns.events.pairs import PairIndex, missed_after
@@ -34,7 +34,7 @@ _UNKNOWN_DEVIATION = 0.5
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number, and the range that it may well lie in."""
+    """A number and its plausible range."""
 
     value: float
     low: float
@@ -43,35 +43,35 @@ class Estimate:
 
 @dataclass(frozen=True)
 class SensorFacts:
-    """What :func:`identify` found."""
+    """Result of :func:`identify`."""
 
     refractory_us: Estimate
-    """Blind time of a pixel after an event."""
+    """Refractory period: a pixel is blind for this long after an event."""
     threshold_ratio: Estimate
-    """C_on / C_off, with the blind time in force."""
+    """C_on / C_off, given the refractory period in use."""
     doubles_us: int
-    """Events that repeat the one before at their pixel within this time are one crossing reported twice; 0: none do."""
+    """Events that repeat the previous one at their pixel within this time report one crossing twice; 0: none do."""
     doubles_share: float
     clock_step_us: int
-    """1 for a clock of microseconds; more where a camera reads out in steps."""
+    """1 for a microsecond clock; more if the camera reads out in steps."""
     flicker_hz: float | None
-    """Of lamps in the picture."""
+    """Flicker frequency of lamps in view."""
     flicker_share: float
-    """Share of the pixels that follow them."""
+    """Share of the pixels that follow the flicker."""
     hot_pixels: int
     dead_pixels: int
-    """Those that cannot fire, told by neighbours that do."""
+    """Pixels that cannot fire, recognised by their active neighbours."""
     blank_share: float
-    """Share of the other pixels that never fired, as nothing passed them."""
+    """Share of the other pixels that never fired because nothing passed them."""
 
 
 _UNKNOWN_RATIO = Estimate(1.0, float(np.exp(-2 * _UNKNOWN_DEVIATION)), float(np.exp(2 * _UNKNOWN_DEVIATION)))
 UNKNOWN_SENSOR = SensorFacts(Estimate(0, 0, 0), _UNKNOWN_RATIO, 0, 0.0, 1, None, 0.0, 0, 0, 0.0)
-"""Of a recording that tells nothing."""
+"""For recordings from which nothing can be estimated."""
 
 
 def identify(index: PairIndex, refractory_us: int | None = None) -> SensorFacts:
-    """What a recording without doubles tells of its sensor; a blind time that is stated goes before the one found."""
+    """Estimate the sensor's properties from a recording without doubles; a given refractory period takes precedence."""
     found = estimated_refractory_us(index)
     in_force = round(found.value) if refractory_us is None else refractory_us
     step_us = clock_step_us(index.events["t_us"])
@@ -91,7 +91,7 @@ def identify(index: PairIndex, refractory_us: int | None = None) -> SensorFacts:
 
 
 def identify_recording(file: RecordingFile, span_us: tuple[int, int], refractory_us: int | None = None) -> SensorFacts:
-    """:func:`identify`, from the first 20 million events within a span; nothing where no pixel has two of them."""
+    """:func:`identify` on the first 20 million events in a span; ``UNKNOWN_SENSOR`` if no pixel has two of them."""
     kept: list[Recording] = []
     for chunk in file.chunks():
         kept.append(chunk.between(*span_us))
@@ -108,15 +108,15 @@ def identify_recording(file: RecordingFile, span_us: tuple[int, int], refractory
 
 
 def estimated_refractory_us(index: PairIndex) -> Estimate:
-    """How long pixels are blind after an event, in whole microseconds; 0 where the recording shows no such time.
+    """Refractory period in whole microseconds; 0 if the recording shows none.
 
-    Intervals between events of one polarity at a pixel are the blind time and what the fastest edges take. Two things
-    tell these apart. Clean recordings have intervals down to a 75th of the usual one: what the shortest has beyond that
-    is blind time. And their shortest intervals spread: three in a thousand lie below 1.6 times the length that three in
-    ten thousand lie below; intervals that a blind time is added to lie closer together. The former counts twice, the
-    latter once; both ratios are those of photographed and drawn scenes at speeds a factor of ten apart. Noise makes
-    intervals of like and of unlike polarity alike, so that the latter are subtracted from the count of the former. A
-    result below 50 us, which blurred edges make as well, is taken as 0.
+    An interval between events of one polarity at a pixel is the refractory period plus the time that the edge takes.
+    Two observations separate them. Without a refractory period, intervals reach down to 1/75 of the median; the
+    shortest interval's excess over that is the refractory period. And the shortest intervals spread: the 0.3 % quantile
+    is 1.6 times the 0.03 % quantile; an added refractory period brings them closer together. The first estimate has
+    weight two, the second one; both ratios were measured on photographed and drawn scenes at speeds a factor of ten
+    apart. Noise produces equal and opposite polarities alike, so the count of intervals of opposite polarity is
+    subtracted. A result below 50 us, which blurred edges also give, is set to 0.
     """
     interval_us, same = _intervals(index)
     like, unlike = np.sort(interval_us[same]), np.sort(interval_us[~same])
@@ -132,23 +132,23 @@ def estimated_refractory_us(index: PairIndex) -> Estimate:
 
 
 def estimated_threshold_ratio(index: PairIndex, refractory_us: int) -> Estimate:
-    """C_on / C_off by balance: what a pixel sees comes back, so that brighter and darker events must cancel.
+    """C_on / C_off by balance: brightness returns to earlier values, so ON and OFF events must cancel.
 
-    Counted, with the events missed while blind, from one turn of a pixel's brightness to another of the same kind
-    (maximum to maximum, or minimum to minimum): between those, log brightness has changed by less than between any
-    other two moments, and neither end's unknown part of a threshold counts. The estimate is the median over pixels,
-    weighted by their events. Its deviation is at least 3 %, and as large as the quarters of the sensor differ; 50 %
-    where fewer than 100 pixels tell anything.
+    Events, including estimates of those missed in the refractory period, are counted between extrema of the same kind
+    of a pixel's brightness (maximum to maximum, or minimum to minimum): between those, log brightness changes less than
+    between other times, and the unknown fraction of a threshold at either end drops out. The estimate is the median
+    over pixels, weighted by their events. Its deviation is the spread between quarters of the sensor, at least 3 %, or
+    50 % if fewer than 100 pixels have enough events.
     """
-    brighter, darker = _between_turns(index.events, index.first, index.responsive, refractory_us)
+    brighter, darker = _between_extrema(index.events, index.first, index.responsive, refractory_us)
     pixel = np.tile(index.responsive, 2)
-    told = brighter + darker >= _EVENTS_TO_BALANCE
-    if np.count_nonzero(told) < _PIXELS_TO_BALANCE:
+    enough = brighter + darker >= _EVENTS_TO_BALANCE
+    if np.count_nonzero(enough) < _PIXELS_TO_BALANCE:
         return _UNKNOWN_RATIO
-    brighter, darker, pixel = brighter[told], darker[told], pixel[told]
+    brighter, darker, pixel = brighter[enough], darker[enough], pixel[enough]
     log_ratio, weight = np.log((darker + 0.5) / (brighter + 0.5)), brighter + darker
     middle = _weighted_median(log_ratio, weight)
-    # Quarters by blocks of pixels in order: bands of the sensor.
+    # Quarters are blocks of consecutive pixels: horizontal bands of the sensor.
     quarters = np.array_split(np.argsort(pixel, kind="stable"), 4)
     apart = [_weighted_median(log_ratio[part], weight[part]) - middle for part in quarters]
     deviation = max(_LEAST_DEVIATION, float(np.sqrt(np.mean(np.square(apart)))))
@@ -156,8 +156,8 @@ def estimated_threshold_ratio(index: PairIndex, refractory_us: int) -> Estimate:
 
 
 def _intervals(index: PairIndex) -> tuple[Int64[np.ndarray, "intervals"], Bool[np.ndarray, "intervals"]]:
-    """Times between events that follow one another at a pixel, of some of the pixels where there are very many events,
-    and whether both are of one polarity."""
+    """Times between consecutive events at a pixel and whether their polarities are equal; pixels are subsampled if
+    there are very many events."""
     counts = np.diff(index.first)[index.responsive]
     every = max(int(counts.sum()) // _AT_MOST_EVENTS, 1)
     return _intervals_of(index.events, index.first, index.responsive[::every])
@@ -183,25 +183,25 @@ def _intervals_of(events, first, pixels):
 
 
 @njit(cache=True)
-def _between_turns(events, first, pixels, refractory_us):
-    """Brighter and darker events of each pixel from the first of its turns to the last one of the same kind; then the
-    same from its second turn."""
+def _between_extrema(events, first, pixels, refractory_us):
+    """ON and OFF events of each pixel from its first brightness extremum to the last one of the same kind; then the
+    same from its second extremum."""
     brighter, darker = np.zeros((2, len(pixels))), np.zeros((2, len(pixels)))
     for i in range(len(pixels)):
         begin, end = first[pixels[i]], first[pixels[i] + 1]
-        # Sums up to and including the event before each turn, for the two kinds of turns in turn.
+        # Sums up to and including the event before each extremum, for the two alternating kinds.
         on = off = 0.0
         start_on, start_off = np.zeros(2), np.zeros(2)
-        turns, before = 0, 0
+        extrema, before = 0, 0
         for k in range(begin, end):
             polarity = events[k].running_polarity - (events[k - 1].running_polarity if k > begin else 0)
             if before != 0 and polarity != before:
-                kind = turns % 2
-                if turns < 2:
+                kind = extrema % 2
+                if extrema < 2:
                     start_on[kind], start_off[kind] = on, off
                 else:
                     brighter[kind, i], darker[kind, i] = on - start_on[kind], off - start_off[kind]
-                turns += 1
+                extrema += 1
             size = 1.0
             if refractory_us > 0 and begin < k < end - 1:
                 size += abs(missed_after(events, k, begin, refractory_us))

@@ -1,7 +1,7 @@
-"""What the times of events tell: steps of the camera's clock, pixels that report one crossing twice, and flicker.
+"""Properties estimated from event times: steps of the camera's clock, double events, and flicker.
 
-Each is found only where it stands out, as a recording without it must not be treated as one that has it. Everything
-is linear in the number of events.
+Each is reported only if it is clear, since false positives would harm good recordings. The cost is linear in the number
+of events.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import welch
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64, Shaped
@@ -29,18 +30,18 @@ _RAYLEIGH, _LEAST_PIXELS, _ALIKE = 10, 0.01, 0.7
 
 
 def clock_step_us(t_us: Int64[np.ndarray, "events"]) -> int:
-    """Step of the camera's clock to the nearest microsecond: 1, but for cameras that read out in steps.
+    """Step of the camera's clock to the nearest microsecond: 1, except for cameras that read out in steps.
 
-    Times come in any order. The quarter of a second around their median counts, with every n-th time beyond 5 million.
-    A step is 4 us to 26 ms long, and over 99 % of the times keep to it but for rounding to whole microseconds. By
-    chance, 1.5 / step of them would.
+    Times may be in any order. Only the quarter second around their median is used, subsampled above 5 million times.
+    A step is 4 us to 26 ms long, and over 99 % of the times lie on it up to rounding to whole microseconds. By chance,
+    1.5 / step of them would.
     """
     t_us = t_us[:: len(t_us) // _MOST_TIMES + 1]
     near = t_us[np.abs(t_us - np.median(t_us)) < _WINDOW_US // 2] if len(t_us) else t_us
     if len(near) < _LEAST_TIMES or len(np.unique(near)) < _LEAST_DISTINCT:
         return 1
     t = near - near.min()
-    # A grid is coherent at all multiples of its frequency: the lowest one is that of the step.
+    # A grid is coherent at all multiples of its frequency; the lowest gives the step.
     coherence = np.abs(np.fft.rfft(np.bincount(t), _PADDING * _WINDOW_US)) / len(t)
     lowest = 10 * _PADDING * _WINDOW_US // (int(t.max()) + 1)
     above = np.flatnonzero(coherence[lowest:] > _COHERENT)
@@ -50,8 +51,8 @@ def clock_step_us(t_us: Int64[np.ndarray, "events"]) -> int:
     step = _PADDING * _WINDOW_US / (first + np.argmax(coherence[first : first + 2 * _PADDING]))
     kept, off = np.ones(len(t), bool), 0.0
     for _ in range(3):
-        turn = np.angle(np.exp(2j * np.pi * t[kept] / step).sum()) / (2 * np.pi)
-        index = np.rint(t / step - turn)
+        phase = np.angle(np.exp(2j * np.pi * t[kept] / step).sum()) / (2 * np.pi)
+        index = np.rint(t / step - phase)
         step, start = np.polyfit(index[kept], t[kept], 1)
         off = np.abs(t - start - step * index)
         kept = off <= np.quantile(off, _ON_GRID)
@@ -62,26 +63,26 @@ def clock_step_us(t_us: Int64[np.ndarray, "events"]) -> int:
 def doubles(
     events: Shaped[np.ndarray, "events"], first: Int64[np.ndarray, "pixels+1"], clock_step_us: int = 1
 ) -> tuple[float, int]:
-    """Share of events that repeat the one before at their pixel, and the time in microseconds within which they do.
+    """Share of events that repeat the previous one at their pixel, and the time in microseconds within which they do.
 
-    Some sensors report one crossing twice: the same polarity within a few microseconds, and then none for hundreds.
-    (0.0, 0) without such a gap up to 200 us, as pixels that cross twice in quick succession have intervals of any
-    length; with over a tenth of the events, as those are fast edges; and where the clock's steps exceed 10 us.
+    Some sensors report one crossing twice: the same polarity within a few microseconds, then nothing for hundreds.
+    Returns (0.0, 0) if there is no such gap up to 200 us, since genuine crossings in quick succession have intervals of
+    any length; for over a tenth of the events, which are fast edges; and for clock steps over 10 us.
     """
     within, bound_us = np.cumsum(_repeats(events, first, _GAP_US)), np.arange(_LONGEST_DOUBLE_US + 1)
     gaps = np.flatnonzero(within[-1] - within[bound_us] <= within[bound_us] / _SPARSER)
     if clock_step_us > _COARSEST_CLOCK_US or not len(gaps):
         return 0.0, 0
-    # The emptiest gap, or the first that leaves next to no double beyond.
-    left = np.maximum(within[4 * gaps] - within[gaps], 0.005 * within[gaps[-1]])
-    within_us = max(int(gaps[np.argmin(left)]), 1)
+    # The emptiest gap, or the first with almost no doubles beyond it.
+    beyond = np.maximum(within[4 * gaps] - within[gaps], 0.005 * within[gaps[-1]])
+    within_us = max(int(gaps[np.argmin(beyond)]), 1)
     share = float(within[within_us] / max(len(events), 1))
     return (share, within_us) if _LEAST_DOUBLES < share < _MOST_DOUBLES else (0.0, 0)
 
 
 @njit(cache=True, nogil=True)
 def _repeats(events, first, longest_us):
-    """Number of events by the time since the event before at their pixel, where that had the same polarity."""
+    """Histogram of the time since the previous event at the pixel, if that had the same polarity."""
     count = np.zeros(longest_us + 1, np.int64)
     for p in range(len(first) - 1):
         before = sum_before = 0
@@ -97,36 +98,37 @@ def _repeats(events, first, longest_us):
 
 @dataclass(frozen=True)
 class Flicker:
-    """Lamps that pixels follow."""
+    """Lamp flicker that pixels follow."""
 
     hz: float | None
-    """Rate at which they get brighter and darker, twice that of the mains for most; None where there are none."""
+    """Flicker frequency, for most lamps twice that of the mains; None without flicker."""
     share_of_pixels: float
     pixels: Bool[np.ndarray, "pixels"]
-    """Those that follow a lamp in at least some of the recording."""
+    """Pixels that follow a lamp in at least part of the recording."""
 
 
 def flicker_hz(
     events: Shaped[np.ndarray, "events"], first: Int64[np.ndarray, "pixels+1"], clock_step_us: int = 1
 ) -> Flicker:
-    """The rate of lamps that flicker, 40 to 1000 Hz, and the pixels that follow it; None under 0.2 s.
+    """Frequency of flickering lamps, 40 to 1000 Hz, and the pixels that follow them; none for recordings under 0.2 s.
 
-    A lamp makes a line in the spectrum of ON minus OFF events of the whole sensor, in both halves of the recording. So
-    do edges that cross one column of pixels after another, frames that disturb the pixels, and a clock with steps.
-    Hence 1 % of the pixels must also turn ON and OFF in phase with the line, cycle by cycle, and most of them together:
-    what vibrates, or a grating that passes, turns each at its own time. A lamp that swings by less than the thresholds
-    is not found: pixels do not follow it, even though their events gather in its phase. Of several rates, the lowest
-    counts. Lines are looked for in the first 100 s of each half; recordings of over an hour are left alone.
+    A lamp produces a line in the spectrum of ON minus OFF events of the whole sensor, in both halves of the recording.
+    So do edges that cross one column of pixels after another, frames that disturb the pixels, and a stepped clock. So
+    1 % of the pixels must also alternate between ON and OFF in phase with the line, cycle by cycle, and most of them in
+    common phase: under vibration or a passing grating, each pixel has its own phase. A lamp that swings by less than
+    the thresholds is not found: pixels do not follow it, even though their events cluster in its phase. The lowest of
+    several frequencies is returned. Lines are searched in the first 100 s of each half; recordings over an hour are
+    skipped.
     """
     pixels = len(first) - 1
-    nothing = Flicker(None, 0.0, np.zeros(pixels, bool))
+    none = Flicker(None, 0.0, np.zeros(pixels, bool))
     begin_us, end_us = (int(events["t_us"].min()), int(events["t_us"].max())) if len(events) else (0, 0)
-    # Bins hold whole steps of the clock, or else a beat of both would show.
+    # Bins are multiples of the clock step to avoid a beat between the two.
     bin_us = max(_BIN_US // clock_step_us, 1) * clock_step_us
     bins = (end_us - begin_us) // bin_us + 1
     length = min(bins // 2, int(_SEGMENT_S * 1e6 / bin_us))
     if end_us - begin_us < _SHORTEST_S * 1e6 or length < 16 or bins > _MOST_BINS:
-        return nothing
+        return none
     rate = _signed_rate(events, first, begin_us, bin_us, bins)
     halves = [rate[at : at + bins // 2][: _MOST_SEGMENTS * length] for at in (0, bins // 2)]
     spectra = [welch(half, 1e6 / bin_us, nperseg=length, nfft=_PADDING * length) for half in halves]
@@ -140,23 +142,23 @@ def flicker_hz(
         low, middle, high = np.log(powers[0] + powers[1])[k - 1 : k + 2]
         line_hz = hz[k] + hz[1] * (low - high) / (2 * (low - 2 * middle + high) - 1e-30)
         segments = rate[: bins // length * length].reshape(-1, length)
-        turns = line_hz * 1e-6 * bin_us * np.arange(length)
-        # Mains drift: each segment has the phase that the line has in it.
-        lamp = segments @ (np.hanning(length) * np.exp(-2j * np.pi * turns))
+        cycles = line_hz * 1e-6 * bin_us * np.arange(length)
+        # The mains frequency drifts, so the phase is estimated per segment.
+        lamp = segments @ (np.hanning(length) * np.exp(-2j * np.pi * cycles))
         lamp /= np.maximum(np.abs(lamp), 1e-30)
-        # Lines are many where frames disturb the pixels: every n-th pixel tells first whether one is a lamp.
+        # Frames that disturb the pixels give many lines: every n-th pixel first decides whether one is a lamp.
         for every in (len(events) // _MOST_SCREENED + 1, 1):
             found = _following(events, first, begin_us, length * bin_us, line_hz * 1e-6, lamp, every)
             if not found.any():
                 break
         else:
             return Flicker(float(line_hz), float(found.mean()), found)
-    return nothing
+    return none
 
 
 @njit(cache=True, nogil=True)
 def _signed_rate(events, first, begin_us, bin_us, bins):
-    """ON minus OFF events of all pixels in each bin of time."""
+    """ON minus OFF events of all pixels per time bin."""
     rate = np.zeros(bins)
     for p in range(len(first) - 1):
         sum_before = 0
@@ -167,19 +169,19 @@ def _signed_rate(events, first, begin_us, bin_us, bins):
 
 
 def _following(events, first, begin_us, segment_us, cycles_per_us, lamp, every) -> np.ndarray:
-    """Pixels, each ``every``-th looked at, that follow the lamp; none unless they are enough and alike."""
-    total, count, cyclic = _turns(events, first, begin_us, segment_us, cycles_per_us, lamp, every)
+    """Pixels among every ``every``-th that follow the lamp; none unless they are enough and in common phase."""
+    total, count, cyclic = _reversals(events, first, begin_us, segment_us, cycles_per_us, lamp, every)
     found = (np.abs(total) ** 2 > _RAYLEIGH * count) & (cyclic > 0.1 * count)
     enough = found.sum() >= max(_LEAST_PIXELS * len(found) / every, 1)
     return found & (enough and np.abs(np.mean(total[found] / np.abs(total[found]))) > _ALIKE)
 
 
 @njit(cache=True, nogil=True)
-def _turns(events, first, begin_us, segment_us, cycles_per_us, lamp, every):
-    """Of each pixel's turns from one polarity to the other: sum of phasors, those of turns to OFF reversed; number; and
-    how many turns to ON come a cycle after the one before.
+def _reversals(events, first, begin_us, segment_us, cycles_per_us, lamp, every):
+    """Statistics of each pixel's polarity reversals: sum of phasors, with those to OFF negated; number; and how many
+    reversals to ON come one cycle after the previous one.
 
-    Events in a row are one turn: those that an edge makes have one phase, whatever the frequency.
+    A run of equal polarities counts once: the events of one edge share a phase at any frequency.
     """
     pixels = len(first) - 1
     total, count, cyclic = np.zeros(pixels, np.complex128), np.zeros(pixels), np.zeros(pixels)
@@ -193,8 +195,8 @@ def _turns(events, first, begin_us, segment_us, cycles_per_us, lamp, every):
             before = polarity
             since_us = events[k].t_us - begin_us
             segment = min(since_us // segment_us, len(lamp) - 1)
-            turn = cycles_per_us * (since_us - segment * segment_us)
-            total[p] += polarity * np.exp(2j * np.pi * turn) * lamp[segment]
+            cycles = cycles_per_us * (since_us - segment * segment_us)
+            total[p] += polarity * np.exp(2j * np.pi * cycles) * lamp[segment]
             count[p] += 1
             if polarity > 0:
                 cyclic[p] += last_on_us >= 0 and 0.5 < cycles_per_us * (since_us - last_on_us) < 1.5

@@ -1,1 +1,1 @@
-"""What users bring: recordings, trajectories, calibrations and datasets of other programs, made into scenes."""
+"""Import of foreign recordings, trajectories, calibrations and datasets into scenes."""

@@ -1,4 +1,4 @@
-"""Cameras as other programs' calibration files describe them."""
+"""Readers for the camera calibration files of other programs."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ ECD_EXPECTED = "9 numbers 'fx fy cx cy k1 k2 p1 p2 k3'"
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A camera, and where it sits on the rig where the file says so."""
+    """A camera and, if the file gives it, its pose on the rig."""
 
     camera: Camera
     rig_from_camera: np.ndarray | None = None
-    """4x4, of the IMU or whatever else the file refers to."""
+    """4x4; the rig frame is the IMU or another reference of the file."""
 
 
 def read_calibration(path: Path, which: str | None = None, sensor_size: Size | None = None) -> Calibrated:
-    """The camera named or numbered ``which``, the only one where not given; raises :class:`SceneError`.
+    """Read the camera with name or number ``which``, by default the only one; raises :class:`SceneError`.
 
     TUM-VIE's (basalt's) JSON, kalibr's camchain and DSEC's YAML, EuRoC's sensor.yaml, ROS' camera_info, OpenCV's YAML
     and XML, the cameras of VINS and ORB-SLAM, Robust e-NeRF's npz, M3ED's h5, a scene.json, and the event camera
-    dataset's calib.txt. ``sensor_size`` is for those that do not say it.
+    dataset's calib.txt. ``sensor_size`` is used for formats that do not store it.
     """
     cameras = _cameras(path, sensor_size)
     if which is None and len(cameras) == 1:
@@ -46,12 +46,12 @@ def read_calibration(path: Path, which: str | None = None, sensor_size: Size | N
 
 
 def read_cameras(path: Path, sensor_size: Size | None = None) -> dict[str, Calibrated]:
-    """All cameras of a calibration file by name, see :func:`read_calibration`; raises :class:`SceneError`."""
+    """Read all cameras of a calibration file by name, see :func:`read_calibration`; raises :class:`SceneError`."""
     return {name: read() for name, read in _cameras(path, sensor_size).items()}
 
 
 def _cameras(path: Path, size: Size | None) -> dict[str, Callable[[], Calibrated]]:
-    """What reads each camera: that one cannot be read does not matter to who wants another."""
+    """A reader per camera, so that an unreadable camera does not affect the others."""
     if not path.is_file():
         what = "a folder" if path.is_dir() else "no such file"
         raise SceneError(f"{path}: {what}, expected a calibration file{did_you_mean(path)}")
@@ -67,7 +67,7 @@ def _cameras(path: Path, size: Size | None) -> dict[str, Callable[[], Calibrated
 
 
 def _of_content(path: Path, content: Any, size: Size | None) -> dict[str, Callable[[], Calibrated]]:
-    """The cameras at whatever level they are."""
+    """Find the cameras at any level of the content."""
     top = Entry(path, "", content)
     if "value0" in top.content:
         return _basalt(top.inner("value0"))
@@ -105,7 +105,7 @@ def _reader(entry: Entry, size: Size | None) -> Callable[[], Calibrated]:
 
 
 def _orb_slam(top: Entry) -> Entry:
-    """Keys such as Camera.fx; of two cameras, the first."""
+    """Entry from keys such as Camera.fx; the first of two cameras."""
     prefix = (
         "Camera." if any(str(key).startswith("Camera.") and "fx" in str(key) for key in top.content) else "Camera1."
     )
@@ -140,7 +140,7 @@ _TURN = ("qx", "qy", "qz", "qw")
 
 
 def pose_matrix(entry: Mapping[str, float]) -> np.ndarray:
-    """4x4 of px py pz qx qy qz qw."""
+    """4x4 matrix from px py pz qx qy qz qw."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat([entry[name] for name in _TURN]).as_matrix()
     matrix[:3, 3] = [entry[name] for name in ("px", "py", "pz")]
@@ -148,7 +148,7 @@ def pose_matrix(entry: Mapping[str, float]) -> np.ndarray:
 
 
 def _chained(entries: Mapping[str, Entry], name: str, size: Size | None) -> Callable[[], Calibrated]:
-    """kalibr's cameras are on the IMU where it says so of all, else as seen from the first."""
+    """kalibr's poses are relative to the IMU if all cameras have T_cam_imu, else to the first camera."""
 
     def read() -> Calibrated:
         entry = entries[name]
@@ -179,7 +179,7 @@ def _nine_numbers(path: Path, text: str, sensor_size: Size | None) -> Camera:
 
 
 def _m3ed(path: Path) -> dict[str, Callable[[], Calibrated]]:
-    """The cameras among the groups with a ``calib``, by the groups' names; the rig is the left event camera."""
+    """The cameras among the groups with a ``calib``, by group name; the rig frame is the left event camera."""
     needed = {"intrinsics", "resolution", "distortion_model", "distortion_coeffs"}
     found: dict[str, Callable[[], Calibrated]] = {}
     try:
@@ -199,7 +199,7 @@ def _m3ed(path: Path) -> dict[str, Callable[[], Calibrated]]:
 
 
 def _value(node: Any) -> Any:
-    """A list, number or text; None of what is none."""
+    """A list, number or text; None for anything else."""
     if not isinstance(node, h5py.Dataset) or node.size is None or node.size > 64:
         return None
     value = np.asarray(node).tolist()

@@ -1,4 +1,4 @@
-"""One camera out of the names and values of a calibration file."""
+"""Convert one entry of a calibration file to a camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ebarf_ns.errors import SceneError
 from ebarf_ns.formats.named_values import Entry, plain
 from ebarf_ns.geometry.cameras import Camera, CameraModel
 
-# Without their underscores and dashes, in lower case.
+# Model names in lower case, without underscores and dashes.
 _MODELS: dict[str, CameraModel] = {
     "pinhole": "pinhole", "perspective": "pinhole", "none": "pinhole", "": "pinhole", "radtan": "radtan",
     "radialtangential": "radtan", "plumbbob": "radtan", "rationalpolynomial": "radtan", "equidistant": "equidistant",
@@ -19,7 +19,7 @@ _MODELS: dict[str, CameraModel] = {
     "fisheye": "equidistant",
 }  # fmt: skip
 _KNOWN_MODELS = "pinhole, radtan (plumb_bob, radial-tangential) or equidistant (kb4, fisheye, KANNALA_BRANDT)"
-# Every program spells its keys in its own way.
+# Spellings of keys by different programs.
 INTRINSICS = ("intrinsics", "camera_matrix", "K", "projection_parameters", "intrinsic_matrix")
 _COEFFICIENTS = (
     "distortion_coeffs", "distortion_coefficients", "distortion_parameters", "distortion_params", "dist_coeffs",
@@ -35,18 +35,18 @@ Size = tuple[int, int]
 
 
 def camera_of(entry: Entry, size: Size | None) -> Camera:
-    """A camera of any layout; the model comes first, which says what its numbers are."""
+    """The camera of an entry in any layout; the model is read first, since it defines the coefficients."""
     model = _model(entry)
     fx, fy, cx, cy = _intrinsics(entry)
     coefficients = _coefficients(entry, model)
-    # Without any coefficient, an equidistant lens is still no pinhole.
+    # An equidistant lens with zero coefficients is still not a pinhole.
     if model != "equidistant" and not any(coefficients):
         model, coefficients = "pinhole", []
     return Camera(model, *_size(entry, size), fx, fy, cx, cy, tuple(coefficients))
 
 
 def _model(entry: Entry) -> CameraModel:
-    """By projection and lens, where the file says so; else what OpenCV's coefficients are."""
+    """Model from the projection and distortion keys, else OpenCV's radtan."""
     said: list[CameraModel] = []
     for spellings in (_LENS, _PROJECTION):
         key = entry.key(spellings)
@@ -63,12 +63,12 @@ def _model(entry: Entry) -> CameraModel:
     bent: list[CameraModel] = [model for model in said if model != "pinhole"]
     if bent:
         return bent[0]
-    # A lens that is said to have no distortion is left without coefficients, see there.
+    # A declared distortion model of none gives a pinhole without coefficients.
     return "radtan" if entry.key(_LENS) is None else "pinhole"
 
 
 def _intrinsics(entry: Entry) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point, in pixels, from a list, a matrix or by their names."""
+    """Focal lengths and principal point in pixels, from a list, a matrix or named values."""
     expected = "4 numbers fx fy cx cy, or a matrix of 3 x 3"
     key = entry.key(INTRINSICS)
     inner = None if key is None else entry.content[key]
@@ -102,7 +102,7 @@ def _pair(entry: Entry, name: str) -> list[float]:
 
 
 def _coefficients(entry: Entry, model: CameraModel) -> list[float]:
-    """As the model has them, from a list or by their names."""
+    """Coefficients of the model, from a list or named values."""
     expected = _OF_EQUIDISTANT if model == "equidistant" else _OF_RADTAN
     key = entry.key(_COEFFICIENTS)
     if key is not None:
@@ -119,7 +119,7 @@ def _coefficients(entry: Entry, model: CameraModel) -> list[float]:
             raise entry.wrong(key, "none, or a distortion_model that has coefficients")
         return []
     if model == "radtan":
-        # OpenCV has up to 14, those after the fifth of models that are not known here.
+        # OpenCV has up to 14; those after the fifth belong to unsupported models.
         values = values if any(values[5:]) else values[:5]
         if len(values) not in (0, 4, 5) and any(values):
             raise entry.wrong(key, expected)
@@ -129,12 +129,12 @@ def _coefficients(entry: Entry, model: CameraModel) -> list[float]:
 
 
 def _is_named(value: Any) -> bool:
-    """Whether numbers are told by their names, not a list or an OpenCV matrix."""
+    """Whether a value holds named numbers, not a list or an OpenCV matrix."""
     return isinstance(value, Mapping) and "data" not in value
 
 
 def _by_name(entry: Entry, model: CameraModel) -> list[float]:
-    """k1, k2 and so on, as far as there are any; VINS begins to count its fisheye's at k2."""
+    """k1, k2 and so on, as far as present; VINS numbers fisheye coefficients from k2."""
     if model != "equidistant":
         names = [name for name in ("k1", "k2", "p1", "p2", "k3") if name in entry.keys]
         names = names and ["k1", "k2", "p1", "p2", *(["k3"] if "k3" in entry.keys else [])]
@@ -165,7 +165,7 @@ def _size(entry: Entry, given: Size | None) -> Size:
 
 
 def matrix_of(entry: Entry, key: str) -> np.ndarray:
-    """4x4; raises :class:`SceneError`."""
+    """A 4x4 pose matrix; raises :class:`SceneError`."""
     expected = "a 4 x 4 matrix of a pose"
     values = entry.numbers(key, expected)
     if len(values) != 16 or abs(np.linalg.det(np.reshape(values, (4, 4)))) < 1e-9:

@@ -1,7 +1,7 @@
-"""Columns that do not say what they are: which is which, and in what unit their times are.
+"""Order of unnamed event columns, and the unit of their times.
 
-Every guess is checked against the values: times never decrease, polarities are 0 and 1 or -1 and 1, coordinates are
-those of a sensor. Where two readings fit, nobody guesses.
+Every guess is checked against the values: times never decrease, polarities are 0 and 1 or -1 and 1, coordinates fit a
+sensor. If two orders fit, an error asks for the order.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ebarf_ns.formats.source import DECIMALS, TimeUnit
 if TYPE_CHECKING:
     from jaxtyping import Num
 
-TELLING_ROWS = 1 << 16
-"""As many events at the beginning, and at the end, tell the order and the unit of all."""
+SAMPLED_ROWS = 1 << 16
+"""Number of events at the beginning and at the end from which order and unit are inferred."""
 ROLES = "txyp"
 _NAMES = {
     "t": ("t", "ts", "time", "times", "timestamp", "timestamps"),
@@ -29,20 +29,20 @@ _NAMES = {
     "y": ("y", "ys", "y_pos", "y_coordinate", "y_coordinates", "y_coord", "ypos", "y_addr", "row"),
     "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on", "sign"),
 }
-# The micro sign, and the Greek letter that looks like it.
+# Includes the micro sign and the similar Greek letter.
 UNITS: dict[str, TimeUnit] = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "milliseconds": "ms", "us": "us",
     "\u00b5s": "us", "\u03bcs": "us", "usec": "us", "microseconds": "us", "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
 }  # fmt: skip
-"""Units as names of columns have them."""
-_EXACT = 2.0**53  # floats beyond are no exact integers
+"""Spellings of units in column names."""
+_EXACT = 2.0**53  # larger floats are not exact integers
 _LARGEST_SENSOR = 8192
 _FEW_ROWS = 8
 _POLARITIES = ({0, 1}, {-1, 1})
 
 
 def named(fields: Iterable[str]) -> dict[str, str] | None:
-    """Which field is t, x, y and p, by their names; None where one of them is missing."""
+    """The fields for t, x, y and p by name; None if one is missing."""
     by_name = {field.lower(): field for field in reversed(list(fields))}
     bare = {_without_unit(name): field for name, field in by_name.items() if _unit_in(name)}
     chosen = {
@@ -53,7 +53,7 @@ def named(fields: Iterable[str]) -> dict[str, str] | None:
 
 
 def unit_of(name: str) -> TimeUnit | None:
-    """The unit that the name of a column says, as in ``t_ns``."""
+    """The unit in a column name, as in ``t_ns``."""
     return UNITS.get(_unit_in(name.lower()))
 
 
@@ -67,57 +67,57 @@ def _without_unit(name: str) -> str:
 
 
 def spaced(order: str) -> str:
-    """``txyp`` as people read it."""
+    """``txyp`` as ``t x y p``."""
     return " ".join(order)
 
 
 def parsed_order(text: str) -> str:
-    """The letters of a flag such as ``x y p t``; raises :class:`RecordingError`."""
+    """Parse a flag such as ``x y p t``; raises :class:`RecordingError`."""
     order = re.sub(r"[\s,;]", "", text.lower())
     if sorted(order) != sorted(ROLES):
         raise RecordingError(f"--event-columns is {text!r:.40}, expected t, x, y and p once each, such as 'x y p t'")
     return order
 
 
-def told_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usual: str) -> tuple[str, str]:
-    """The order of four columns, a letter each, and what tells it; ``usual`` where the values do not contradict it.
+def inferred_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usual: str) -> tuple[str, str]:
+    """Infer the order of four columns and explain it; ``usual`` if the values do not contradict it.
 
-    Raises :class:`RecordingError` where the values fit several.
+    Raises :class:`RecordingError` if the values fit several orders.
     """
     readings = {order: _fit(columns, order) for order in _orders()}
     certain = [order for order, fit in readings.items() if fit == 2]
     usual_fits = readings[usual] > 0
     if len(columns[0]) < _FEW_ROWS:
-        return usual, "as is usual: too few events tell nothing else"
+        return usual, "the usual order: too few events to check it"
     if usual_fits and certain in ([], [usual]):
-        return usual, "as is usual, and as their values are: times never decrease, polarities are 0 or -1, and 1"
+        return usual, "the usual order, which the values fit: times never decrease, polarities are 0 or -1, and 1"
     fitting = certain or [order for order, fit in readings.items() if fit]
     if usual_fits and usual not in fitting:
         fitting.append(usual)
     if len(fitting) == 1:
-        return fitting[0], "told by their values: times never decrease, polarities are 0 or -1, and 1"
+        return fitting[0], "inferred from the values: times never decrease, polarities are 0 or -1, and 1"
     if fitting:
         both = " and as ".join(repr(spaced(order)) for order in fitting)
-        raise RecordingError(f"{path}: columns without names read as {both}, expected --event-columns with the one")
+        raise RecordingError(f"{path}: columns without names read as {both}, expected --event-columns with the order")
     unsorted = [order for order in readings if _fits_unsorted(columns, order)]
     if usual not in unsorted and len(unsorted) == 1:
-        return unsorted[0], "told by their values, though times do decrease"
-    return usual, "as is usual, though their values are not like that"
+        return unsorted[0], "inferred from the values, although times decrease"
+    return usual, "the usual order, although the values do not fit it"
 
 
 def look_like_events(columns: Sequence[Num[np.ndarray, "events"]]) -> bool:
-    """Whether four columns are events in some order, where other arrays of such a shape are about."""
+    """Whether four columns look like events in some order, to separate them from other arrays of that shape."""
     enough = len(columns[0]) >= _FEW_ROWS
     return enough and any(_fit(columns, order) > 0 or _fits_unsorted(columns, order) for order in _orders())
 
 
 def _orders() -> list[str]:
-    """All with x before y, as nothing in their values tells one from the other."""
+    """All orders with x before y, since the values cannot distinguish these two."""
     return ["".join(order) for order in permutations(ROLES) if order.index("x") < order.index("y")]
 
 
 def _fit(columns: Sequence[np.ndarray], order: str) -> int:
-    """0: not like that; 1: it may be; 2: times do increase, and polarities are of both kinds."""
+    """0: does not fit; 1: fits; 2: fits, with increasing times and both polarities."""
     t, p = (columns[order.index(role)] for role in "tp")
     if not len(t) or not _polarities(p) or not _coordinates(columns, order):
         return 0
@@ -144,17 +144,17 @@ def _of_a_sensor(column: np.ndarray) -> bool:
 
 
 def is_whole(column: np.ndarray) -> bool:
-    """Whether all are integers, of whatever type."""
+    """Whether all values are integers, of any type."""
     return column.dtype.kind in "iub" or (column.dtype.kind == "f" and bool((column == np.rint(column)).all()))
 
 
 def guessed_unit(t: Num[np.ndarray, "events"]) -> TimeUnit:
-    """Microseconds where times are whole numbers, seconds where they have fractions."""
+    """Microseconds for integer times, seconds for fractional ones."""
     return "us" if t.dtype.kind != "f" or (is_whole(t) and len(t) > 0 and t.min() != t.max()) else "s"
 
 
 def coarseness(t: Num[np.ndarray, "events"], unit: TimeUnit) -> list[str]:
-    """What is lost of times whose type holds no microseconds that late; or of times that went through such a type."""
+    """Note on precision lost by times whose type cannot resolve microseconds, now or in an earlier conversion."""
     if t.dtype.kind != "f" or not len(t) or not np.isfinite(t).all():
         return []
     was = "are"
@@ -164,19 +164,21 @@ def coarseness(t: Num[np.ndarray, "events"], unit: TimeUnit) -> list[str]:
     step_us = float(np.spacing(latest)) * 10.0 ** DECIMALS[unit]
     if step_us <= 1:
         return []
-    return [f"times {was} {t.dtype}, which lie {step_us:.3g} us apart at {latest:.6g} {unit}: what is finer is lost"]
-
-
-def telling(columns: Sequence[Any]) -> list[np.ndarray]:
-    """The first and the last events of columns that may be on disk."""
     return [
-        np.concatenate([column[:TELLING_ROWS], column[max(TELLING_ROWS, len(column) - TELLING_ROWS) :]])
+        f"times {was} {t.dtype}, with a resolution of {step_us:.3g} us at {latest:.6g} {unit}: finer times are lost"
+    ]
+
+
+def sampled(columns: Sequence[Any]) -> list[np.ndarray]:
+    """The first and last events of columns that may be on disk."""
+    return [
+        np.concatenate([column[:SAMPLED_ROWS], column[max(SAMPLED_ROWS, len(column) - SAMPLED_ROWS) :]])
         for column in columns
     ]
 
 
 def integers(path: Path, column: np.ndarray, name: str, first: int) -> np.ndarray:
-    """As integers, which floats may be too, as in ESIM's rows; ``first`` is the row of the first."""
+    """Convert a column to integers, from floats too, as in ESIM's rows; ``first`` is its first row number."""
     if column.dtype.kind in "iub":
         return column.astype(np.uint8) if column.dtype == bool else np.asarray(column)
     whole = (np.abs(column) < _EXACT) & (column == np.rint(column)) if column.dtype.kind == "f" else np.zeros(1, bool)

@@ -1,4 +1,4 @@
-"""Whether what a file holds are events of a sensor: values, polarity, order of time."""
+"""Checks of raw events: coordinates, polarity, time order."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Int64
 
 MAX_TIME_US = 1 << 61
-# Counters of 31 and 32 bits begin anew; before and after that they are this near to their ends.
+# Timestamp counters of 31 and 32 bits wrap around; a wrap is accepted this close to the ends of the range.
 _WRAPS_US, _NEAR_US = (1 << 31, 1 << 32), 1_000_000
 
 
 def late(t_us: Int64[np.ndarray, "events"], before_us: int | None) -> Bool[np.ndarray, "events"]:
-    """Which events are earlier than the one before."""
+    """Which events are earlier than the previous one."""
     late = np.empty(len(t_us), bool)
     late[0] = before_us is not None and t_us[0] < before_us
     np.less(t_us[1:], t_us[:-1], out=late[1:])
@@ -28,17 +28,17 @@ def late(t_us: Int64[np.ndarray, "events"], before_us: int | None) -> Bool[np.nd
 
 
 def check_values(source: Source, piece: Piece, width: int, height: int) -> None:
-    """Raise :class:`RecordingError` for pixels outside the sensor and times that none can be."""
+    """Raise :class:`RecordingError` for pixels outside the sensor and impossible times."""
     x, y, t_us = piece.x, piece.y, piece.t_us
     wide, high = int(x.max()), int(y.max())
-    # One look at the extremes, and only where they are wrong a look at each.
+    # Check the extremes first, and single events only if those are wrong.
     if wide < width and high < height and int(x.min()) >= 0 and int(y.min()) >= 0 and _plausible(t_us):
         return
     swapped = _read_as(source)
     if wide < height and high < width:
         other = source.columns.translate(str.maketrans("xy", "yx"))
         swapped = f"; x reaches {wide} and y {high}: are they swapped?"
-        swapped += f" --event-columns '{' '.join(other)}' says so" if other else ""
+        swapped += f" Then use --event-columns '{' '.join(other)}'" if other else ""
     for name, column, wrong, expected in (
         ("x", x, (x < 0) | (x >= width), f"0 to {width - 1}, the sensor width{swapped}"),
         ("y", y, (y < 0) | (y >= height), f"0 to {height - 1}, the sensor height{swapped}"),
@@ -53,10 +53,8 @@ def check_values(source: Source, piece: Piece, width: int, height: int) -> None:
 
 
 def _read_as(source: Source) -> str:
-    """Of columns without names, how they were read, and what says otherwise."""
-    return (
-        f"; columns are read as '{' '.join(source.columns)}', --event-columns says otherwise" if source.columns else ""
-    )
+    """For columns without names, how they were read, and the flag to change that."""
+    return f"; columns are read as '{' '.join(source.columns)}', --event-columns changes that" if source.columns else ""
 
 
 def _plausible(t_us: np.ndarray) -> bool:
@@ -64,7 +62,7 @@ def _plausible(t_us: np.ndarray) -> bool:
 
 
 def check_polarity(source: Source, piece: Piece, lowest: int, highest: int) -> None:
-    """Either 0 and 1 or -1 and 1, in the whole file."""
+    """Raise :class:`RecordingError` unless polarities are 0 and 1, or -1 and 1, in the whole file."""
     signed = lowest < 0
     p = piece.polarity
     wrong = (p != -1) & (p != 1) if signed else (p != 0) & (p != 1)
@@ -77,28 +75,28 @@ def check_polarity(source: Source, piece: Piece, lowest: int, highest: int) -> N
 
 
 def unwrapped(
-    t_us: Int64[np.ndarray, "events"], before_us: int | None, turned_us: int, repaired: Counter[str]
+    t_us: Int64[np.ndarray, "events"], before_us: int | None, wrapped_us: int, repaired: Counter[str]
 ) -> tuple[Int64[np.ndarray, "events"], int]:
-    """Times that run on where a counter of 31 or 32 bits began anew, which leaves no doubt at such values."""
+    """Unwrap times where a 31- or 32-bit counter overflowed, which is unambiguous at such values."""
     for k in np.flatnonzero(late(t_us, before_us)).tolist():
         before = int(t_us[k - 1]) if k else before_us
         assert before is not None
         for wrap_us in _WRAPS_US:
-            # A signed counter goes on at minus its range.
-            lowest = -wrap_us if wrap_us == 1 << 31 and t_us[k] - turned_us < 0 else 0
-            counted = before - turned_us
-            if 0 <= wrap_us - counted < _NEAR_US and 0 <= int(t_us[k]) - turned_us - lowest < _NEAR_US:
+            # A signed counter continues at minus its range.
+            lowest = -wrap_us if wrap_us == 1 << 31 and t_us[k] - wrapped_us < 0 else 0
+            counted = before - wrapped_us
+            if 0 <= wrap_us - counted < _NEAR_US and 0 <= int(t_us[k]) - wrapped_us - lowest < _NEAR_US:
                 t_us[k:] += wrap_us - lowest
-                turned_us += wrap_us - lowest
-                repaired[f"times after the counter of {wrap_us.bit_length() - 1} bits began anew"] += 1
+                wrapped_us += wrap_us - lowest
+                repaired[f"overflows of the {wrap_us.bit_length() - 1}-bit time counter"] += 1
                 break
-    return t_us, turned_us
+    return t_us, wrapped_us
 
 
 def check_order(
     path: Path, piece: Piece, t_us: np.ndarray, before_us: int | None, unsorted: str, repaired: Counter[str]
 ) -> None:
-    """Raise :class:`RecordingError` for events earlier than those before, or count them where they will be sorted."""
+    """Raise :class:`RecordingError` for events earlier than the previous ones, or count them if they will be sorted."""
     early = late(t_us, before_us)
     if not early.any():
         return
@@ -109,4 +107,4 @@ def check_order(
             f"{path}: {piece.place(k)} is at {t_us[k]} us, after one at {before} us; expected events in order of time "
             f"({np.count_nonzero(early):,} such of the {len(piece):,} around it), or --unsorted sort to sort them"
         )
-    repaired["events were earlier than the one before, and are sorted"] += int(np.count_nonzero(early))
+    repaired["events earlier than the previous one, now sorted"] += int(np.count_nonzero(early))

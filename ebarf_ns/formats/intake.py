@@ -1,7 +1,7 @@
-"""From any source to the scene's ``events.h5``: every event checked, nothing lost in silence, memory bounded.
+"""Convert any source to the scene's ``events.h5``: every event is checked, every loss reported, memory bounded.
 
-What a file does wrong is one of three things: an error; a repair that was asked for, or that leaves no doubt, and is
-counted; or nothing wrong at all, like equal times at different pixels.
+An irregularity in a file is either an error; a repair that was requested or is unambiguous, and is counted; or
+harmless, like equal times at different pixels.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.events.recording import Recording, joined, write_recording
 from ebarf_ns.formats.event_checks import MAX_TIME_US, check_order, check_polarity, check_values, late, unwrapped
 from ebarf_ns.formats.source import Source
@@ -29,36 +29,36 @@ _MERGED_AT_ONCE, _SAMPLE_EVERY = 1 << 20, 1 << 10
 
 @dataclass(frozen=True)
 class Intake:
-    """What to do with events on their way in."""
+    """Filters and repairs applied to events on import."""
 
     unsorted: Literal["refuse", "sort"] = "refuse"
-    """Of events that are earlier than those before them: refuse the file, or sort it (stably)."""
+    """Events earlier than the previous ones: refuse the file, or sort it (stably)."""
     duplicates: Literal["keep", "drop"] = "keep"
-    """Of events equal to the last one of their pixel in time and polarity."""
+    """Events equal in time and polarity to the last one of their pixel."""
     hot_pixels: float | None = None
-    """Leave out pixels with more events than the median of the active ones plus this many median deviations."""
+    """Drop pixels with more events than the median of the active ones plus this many median deviations."""
     refractory_us: int = 0
-    """Leave out events that follow the last one kept of their pixel within less than this."""
+    """Drop events closer than this to the last kept event of their pixel."""
     flip_polarity: bool = False
-    """Take brighter for darker, for a source that has them the other way round."""
+    """Swap ON and OFF, for a source with inverted polarity."""
     flip_x: bool = False
-    """Mirror columns, for events whose x counts from the right; frames and calibration stay as they are."""
+    """Mirror columns, for events whose x counts from the right; frames and calibration are unchanged."""
     flip_y: bool = False
-    """Mirror rows, for events whose y counts from below; frames and calibration stay as they are."""
+    """Mirror rows, for events whose y counts from the bottom; frames and calibration are unchanged."""
     crop: tuple[int, int, int, int] | None = None
-    """Keep the pixels from column X0 and row Y0 up to, but without, column X1 and row Y1; after mirroring. Camera and
-    its frames are cropped with them."""
+    """Keep pixels from column X0 and row Y0 to column X1 and row Y1 (exclusive), after mirroring. The camera and its
+    frames are cropped too."""
     time_offset_us: int = 0
-    """Added to every time."""
+    """Offset added to every time."""
     start_us: int | None = None
-    """Leave out events before this, on the recording's own clock after the offset."""
+    """Drop events before this time, on the recording's clock after the offset."""
     end_us: int | None = None
-    """Leave out events after this."""
+    """Drop events after this time."""
 
 
 @dataclass
 class IntakeReport:
-    """What was read, repaired and left out."""
+    """Counts of events read, repaired and left out."""
 
     format: str = ""
     read: int = 0
@@ -70,7 +70,7 @@ class IntakeReport:
     notes: tuple[str, ...] = ()
 
     def sentences(self) -> list[str]:
-        """For people."""
+        """The report as sentences."""
         span_s = (self.last_us - self.first_us) * 1e-6
         found = [f"{self.format}: {self.read:,} events read, {self.kept:,} kept, over {span_s:.3f} s", *self.notes]
         found += [f"left out: {count:,} {reason}" for reason, count in self.left_out.items() if count]
@@ -88,8 +88,8 @@ def take_in(
 ) -> IntakeReport:
     """Write ``output`` in the layout that :class:`~ebarf_ns.events.recording.RecordingFile` reads.
 
-    ``hot`` marks the pixels to leave out, see :func:`hot_pixels`. Raises :class:`RecordingError` naming file, place,
-    value and expectation for whatever is not an event of a sensor of that size, in order.
+    ``hot`` marks pixels to leave out, see :func:`hot_pixels`. Raises :class:`RecordingError`, naming file, place, value
+    and expectation, for anything but ordered events of a sensor of that size.
     """
     report = IntakeReport(source.format, notes=source.notes + _flips(intake))
     pieces = _checked(source, sensor_size, intake, report, progress)
@@ -109,17 +109,17 @@ def _flips(intake: Intake) -> tuple[str, ...]:
 
 
 def checked(source: Source, sensor_size: tuple[int, int]) -> Recording:
-    """All events in memory, for recordings that are small; raises what :func:`take_in` raises."""
+    """Read a small recording into memory; raises what :func:`take_in` raises."""
     return joined(_checked(source, sensor_size, Intake(), IntakeReport(), lambda events: None))
 
 
 def hot_pixels(
     source: Source, sensor_size: tuple[int, int], intake: Intake, deviations: float
 ) -> Bool[np.ndarray, "pixels"]:
-    """Pixels far busier than usual over the whole recording: median + ``deviations`` x median absolute deviation.
+    """Pixels with more events over the whole recording than median + ``deviations`` x median absolute deviation.
 
-    Of pixels that have events at all; a deviation counts at least a tenth of the median, lest evenly busy sensors
-    have hot pixels.
+    Statistics are over pixels with events; the deviation is at least a tenth of the median, so that evenly active
+    sensors have no hot pixels.
     """
     width, height = sensor_size
     counts = np.zeros(width * height, np.int64)
@@ -129,7 +129,7 @@ def hot_pixels(
 
 
 def far_busier(counts: Int64[np.ndarray, "*pixels"], deviations: float) -> Bool[np.ndarray, "*pixels"]:
-    """Which pixels have far more events than usual, see :func:`hot_pixels`."""
+    """Pixels with far more events than the median, see :func:`hot_pixels`."""
     active = counts[counts > 0]
     if not len(active):
         return counts > 0
@@ -145,16 +145,16 @@ def _checked(
     report: IntakeReport,
     progress: Callable[[int], None],
 ) -> Iterator[Recording]:
-    """Pieces of valid events, in the order of the file, within the window."""
+    """Pieces of valid events in file order, within the time window."""
     width, height = sensor_size
-    turned_us, before_us, lowest, highest = 0, None, 1, 0
+    wrapped_us, before_us, lowest, highest = 0, None, 1, 0
     for piece in source.pieces:
         check_values(source, piece, width, height)
         lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
         check_polarity(source, piece, lowest, highest)
-        t_us = piece.t_us + turned_us if turned_us else piece.t_us
+        t_us = piece.t_us + wrapped_us if wrapped_us else piece.t_us
         if late(t_us, before_us).any():
-            t_us, turned_us = unwrapped(t_us.copy(), before_us, turned_us, report.repaired)
+            t_us, wrapped_us = unwrapped(t_us.copy(), before_us, wrapped_us, report.repaired)
             check_order(source.path, piece, t_us, before_us, intake.unsorted, report.repaired)
         before_us = int(t_us[-1]) if before_us is None else max(before_us, int(t_us.max()))
         report.read += len(piece)
@@ -179,7 +179,7 @@ def _windowed(events: Recording, intake: Intake, report: IntakeReport) -> Record
 
 
 def _sorted(pieces: Iterable[Recording], report: IntakeReport) -> Iterator[Recording]:
-    """All events by time, those of equal time in the order of the file; sorted pieces wait in a temporary file."""
+    """Sort all events by time, stably, with an external merge sort in a temporary file."""
     with tempfile.TemporaryFile() as file:
         ends = [0]
         for piece in pieces:
@@ -211,7 +211,7 @@ def _filtered(
     hot: np.ndarray | None,
     report: IntakeReport,
 ) -> Iterator[Recording]:
-    """Without duplicates, hot pixels and events too soon, as far as asked for; pieces without events are left out."""
+    """Drop duplicates, hot pixels and events in the refractory period, as requested; empty pieces are skipped."""
     width, height = sensor_size
     last_us = np.full(width * height, -MAX_TIME_US)
     last_polarity = np.zeros(width * height, np.int8)
@@ -224,8 +224,8 @@ def _filtered(
         if intake.duplicates == "drop" or intake.refractory_us:
             columns = piece.pixels(width), piece.t_us, piece.polarity
             why = _superfluous(*columns, last_us, last_polarity, intake.duplicates == "drop", intake.refractory_us)
-            report.left_out["events twice over"] += int(np.count_nonzero(why == 1))
-            report.left_out["events within the refractory time"] += int(np.count_nonzero(why == 2))
+            report.left_out["duplicate events"] += int(np.count_nonzero(why == 1))
+            report.left_out["events in the refractory period"] += int(np.count_nonzero(why == 2))
             piece = piece.select(why == 0)  # noqa: PLW2901
         if intake.crop:
             piece = _cropped(piece, intake.crop, report)  # noqa: PLW2901
@@ -243,7 +243,7 @@ def _cropped(events: Recording, crop: tuple[int, int, int, int], report: IntakeR
 
 @njit(cache=True)
 def _superfluous(pixel, t_us, polarity, last_us, last_polarity, drop_equal, refractory_us):
-    """1 for an event like its pixel's last, 2 for one too soon after the last that is kept; those are remembered."""
+    """1 for a duplicate of the pixel's last kept event, 2 for one too soon after it; kept events update the state."""
     why = np.zeros(len(pixel), np.int8)
     for i in range(len(pixel)):
         p = pixel[i]

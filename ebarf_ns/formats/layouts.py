@@ -1,4 +1,4 @@
-"""Where datasets keep what: from a folder as it was downloaded to the ingredients of a scene."""
+"""Folder layouts of public datasets, read into the ingredients of a scene."""
 
 from __future__ import annotations
 
@@ -33,44 +33,44 @@ _GREY_CAMERAS = {"left": "0", "right": "1"}
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A picture that a camera took."""
+    """A frame of a camera."""
 
     picture: Path | np.ndarray
-    """A file, or grey of 8 or 16 bits."""
+    """A file, or an 8- or 16-bit grey image."""
     t_us: int
     camera: Camera | None
-    """None: the event camera itself."""
+    """None: the event camera."""
     event_camera_from_frame_camera: np.ndarray
     intensity: FrameIntensity
 
 
 @dataclass(frozen=True)
 class Ingredients:
-    """What a dataset's folder has for a scene."""
+    """Contents of a dataset's folder for a scene."""
 
     open_events: Callable[[], Source]
     camera: Camera | None = None
     groundtruth: Trajectory | None = None
     frames: Iterable[FrameFile] = ()
     frames_left_out: Counter[str] = field(default_factory=Counter)
-    """Those that are not among them, by topic and reason; counted while they are read."""
+    """Number of skipped frames, by topic and reason; counted while reading."""
     contrast_threshold: ContrastThreshold | None = None
     notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Given:
-    """What somebody says of a dataset's folder, or wants of it."""
+    """User settings for reading a dataset's folder."""
 
     camera: Path | None = None
-    """A calibration file in place of the folder's own."""
+    """A calibration file that replaces the folder's own."""
     sensor_size: tuple[int, int] | None = None
     part: str | None = None
-    """Of two event cameras, which."""
+    """Which of two event cameras."""
     frames: bool = True
-    """Whether pictures are looked for."""
+    """Whether to read frames."""
     event_time_unit: TimeUnit | None = None
-    """Of the events, where it is not the usual one."""
+    """Unit of the event times, if not the dataset's usual one."""
 
 
 NOTHING_GIVEN = Given()
@@ -84,7 +84,7 @@ def ecd(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     groundtruth, notes = None, []
     if (folder / "groundtruth.txt").is_file():
         groundtruth, notes = read_trajectory(folder / "groundtruth.txt", TrajectoryFormat("s", "xyzw"))
-    # The DAVIS' frames are linear up to its sensor's offset.
+    # DAVIS frames are linear up to an offset of the sensor.
     listed = _listed(folder / "images.txt", "s") if given.frames else []
     frames = tuple(FrameFile(path, t_us, None, np.eye(4), "linear") for t_us, path in listed)
     return Ingredients(
@@ -93,10 +93,10 @@ def ecd(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
 
 
 def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
-    """TUM-VIE (Klenk et al. 2021): ``*events_left.h5``, mocap_data.txt and the calibrations A or B beside them.
+    """TUM-VIE (Klenk et al. 2021): ``*events_left.h5``, mocap_data.txt and calibration A or B in the same folder.
 
-    The marker's poses become the event camera's by T_mocap_marker · T_imu_marker⁻¹ · T_imu_cam. ``part`` is left or
-    right, left where not given.
+    Marker poses are converted to event camera poses by T_mocap_marker · T_imu_marker⁻¹ · T_imu_cam. ``part`` is left
+    (default) or right.
     """
     side = given.part or "left"
     if side not in _EVENT_CAMERAS:
@@ -113,9 +113,7 @@ def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
         imu_from_marker = _imu_from_marker(marker)
         groundtruth = _moved(marker_path, np.linalg.inv(imu_from_marker) @ _rig(event_camera, cameras))
     elif mocap:
-        notes.append(
-            f"{mocap.name} is left out: it has poses of a marker, and {marker.name}, which relates it, is missing"
-        )
+        notes.append(f"{mocap.name} is left out: it has poses of a marker whose calibration, {marker.name}, is missing")
     event_from_grey = np.linalg.inv(_rig(event_camera, cameras)) @ _rig(grey_camera, cameras)
     frames = []
     for stamps in folder.glob(f"**/image_timestamps_{side}.txt") if given.frames else ():
@@ -135,10 +133,10 @@ def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
 
 
 def eds(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
-    """EDS (Hidalgo-Carrió et al. 2022): events.h5 with its columns at top level, poses of the event camera.
+    """EDS (Hidalgo-Carrió et al. 2022): events.h5 with columns at top level, poses of the event camera.
 
-    The frames, images/ with images_timestamps.txt [us], are another camera's: ``camera`` says where that is, as a
-    kalibr file with cam0 (frames) and cam1 (events).
+    The frames, images/ with images_timestamps.txt [us], are from another camera; ``camera`` is then a kalibr file with
+    cam0 (frames) and cam1 (events).
     """
     cameras, groundtruth, notes, frames = given.camera, None, [], []
     poses, stamps = folder / "stamped_groundtruth.txt", folder / "images_timestamps.txt"
@@ -154,7 +152,7 @@ def eds(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
             for path, t_us in zip(images, _times(stamps, len(images)), strict=True)
         ]
     elif stamped:
-        notes.append("the frames are another camera's; without a --camera file that has both, they are left out")
+        notes.append("the frames are from another camera; without a --camera file with both, they are left out")
     return Ingredients(
         lambda: read_hdf5(folder / "events.h5", None, given.event_time_unit),
         None,
@@ -165,7 +163,7 @@ def eds(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
 
 
 def esim(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
-    """ESIM's and E-NeRF's synthetic recordings: events/*.npy, *poses_all*.txt (ns); images are left where they are."""
+    """Synthetic recordings of ESIM and E-NeRF: events/*.npy, *poses_all*.txt (ns); images are not used."""
     groundtruth, notes = None, []
     poses = _at_most_one(folder, "**/*poses_all*.txt")
     if poses:
@@ -195,7 +193,7 @@ LAYOUTS: dict[Layout, Callable[[Path, Given], Ingredients]] = {
 
 
 def recognised_layout(folder: Path) -> Layout:
-    """By the files in a folder; raises :class:`SceneError`."""
+    """Recognise the dataset by the files in its folder; raises :class:`SceneError`."""
     marks: dict[Layout, str] = {
         "ecd": "events.txt", "tumvie": "*events_*.h5", "eds": "events.h5", "robust-e-nerf": "raw_events.npz",
         "esim": "events/*.npy",
@@ -210,7 +208,7 @@ def recognised_layout(folder: Path) -> Layout:
 
 
 def _moved(trajectory: Trajectory, body_from_camera: np.ndarray) -> Trajectory:
-    """The poses of a camera that is fixed to the body whose poses these are."""
+    """Camera poses from the poses of the body to which the camera is fixed."""
     turn = Rotation.from_matrix(body_from_camera[:3, :3]).as_quat()[[3, 0, 1, 2]]
     count = len(trajectory.t_us)
     local = Poses(torch.from_numpy(body_from_camera[:3, 3]).expand(count, 3), torch.from_numpy(turn).expand(count, 4))
@@ -257,7 +255,7 @@ def _at_most_one(folder: Path, pattern: str) -> Path | None:
 
 
 def _listed(path: Path, unit: Literal["s", "us"]) -> list[tuple[int, Path]]:
-    """Lines "time file"."""
+    """Times and files from lines "time file"."""
     images = []
     lines = _lines(path) if path.is_file() else []
     for number, line in enumerate(lines, start=1):
@@ -277,7 +275,7 @@ def _listed(path: Path, unit: Literal["s", "us"]) -> list[tuple[int, Path]]:
 
 
 def _times(path: Path, count: int) -> list[int]:
-    """A time in microseconds a line, after a line of names."""
+    """One time in microseconds per line, after a header line."""
     lines = [line.split()[0] for line in _lines(path) if line.strip()]
     lines = [line for line in lines if re.fullmatch(r"\d+(\.\d*)?", line)]
     if len(lines) != count:

@@ -1,4 +1,4 @@
-"""Names and values of JSON, YAML and XML files, with the place of each for messages."""
+"""Names and values in JSON, YAML and XML files, with their location for error messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KNOWN_LAYOUTS = (
 
 
 def text_of(path: Path) -> str:
-    """The text of a file; raises :class:`SceneError`."""
+    """Read a text file; raises :class:`SceneError`."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -32,7 +32,7 @@ def text_of(path: Path) -> str:
 
 
 class _AnyTag(yaml.SafeLoader):
-    """Plain values whatever their tags, such as OpenCV's, say."""
+    """Loads plain values and ignores tags such as OpenCV's."""
 
 
 def _untagged(loader: yaml.SafeLoader, _: str, node: yaml.Node) -> Any:
@@ -47,7 +47,7 @@ _AnyTag.add_multi_constructor("", _untagged)
 
 
 def parsed(path: Path, text: str) -> Any:
-    """The content of JSON, XML or YAML, of which the first document."""
+    """Parse JSON, XML or the first document of YAML."""
     try:
         if path.suffix.lower() == ".json":
             return json.loads(text)
@@ -63,14 +63,14 @@ def parsed(path: Path, text: str) -> Any:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
         raise SceneError(f"{path}{line}: not valid YAML ({error.problem or error.context})") from None
     except yaml.reader.ReaderError as error:
-        raise SceneError(f"{path}: not valid YAML (character {error.position} is none that text has)") from None
+        raise SceneError(f"{path}: not valid YAML (character {error.position} is not a text character)") from None
     except (RecursionError, ValueError, TypeError, LookupError, AttributeError):
-        # What YAML takes for a date, or a key, may be none.
+        # YAML may misread a value as a date or a key.
         raise SceneError(f"{path}: cannot be read as names and values, expected {KNOWN_LAYOUTS}") from None
 
 
 def _of_element(element: ElementTree.Element) -> Any:
-    """What OpenCV's XML says: text, or what is named in it; a list's parts have no name."""
+    """Convert an element of OpenCV's XML: text, a mapping of named children, or a list of unnamed ones."""
     parts = list(element)
     if not parts:
         return (element.text or "").strip().strip('"')
@@ -80,19 +80,19 @@ def _of_element(element: ElementTree.Element) -> Any:
 
 
 def shown(value: object) -> str:
-    """For messages: a beginning, whatever is in a file."""
-    beginning = Repr()
-    beginning.maxlevel = 2
-    return beginning.repr(value)
+    """Shortened repr for messages."""
+    shortened = Repr()
+    shortened.maxlevel = 2
+    return shortened.repr(value)
 
 
 def plain(name: object) -> str:
-    """A name without case, underscores and dashes."""
+    """A name in lower case without underscores and dashes."""
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
 class Entry:
-    """A mapping that knows where it stands, so that every complaint names file and key; keys have many spellings."""
+    """A mapping with its location, so that errors name file and key; keys may have several spellings."""
 
     def __init__(self, path: Path, place: str, content: object):
         if not isinstance(content, Mapping):
@@ -103,32 +103,32 @@ class Entry:
         self.keys = {plain(key): key for key in content}
 
     def name(self, key: object) -> str:
-        """Where a key stands."""
+        """Dotted path of a key."""
         return f"{self.place}.{key}" if self.place else str(key)
 
     def key(self, spellings: Sequence[str]) -> Any:
-        """The key as it is spelled here; None where it has no value."""
+        """The key as spelled in this file; None if it has no value."""
         found = (self.keys[plain(one)] for one in spellings if plain(one) in self.keys)
         return next((key for key in found if self.content[key] is not None), None)
 
     def inner(self, key: Any) -> Entry:
-        """What a key holds."""
+        """The mapping under a key."""
         return Entry(self.path, self.name(key), self.content.get(key))
 
     def wrong(self, key: Any, expected: str) -> SceneError:
-        """The complaint about a key's value."""
+        """The error for a wrong value of a key."""
         found = f"is {shown(self.content[key])}" if key in self.content else "is missing"
         return SceneError(f"{self.path}: {self.name(key)} {found}, expected {expected}")
 
     def numbers(self, key: Any, expected: str) -> list[float]:
-        """Finite ones, of a list, of a list of lists, or of an OpenCV matrix."""
+        """Finite numbers from a list, a list of lists, or an OpenCV matrix."""
         found = numbers_of(self.content.get(key))
         if found is None or not np.isfinite(found).all():
             raise self.wrong(key, expected)
         return found
 
     def number(self, spellings: Sequence[str], expected: str = "a number") -> float:
-        """A finite one."""
+        """One finite number."""
         key = self.key(spellings)
         values = self.numbers(spellings[0] if key is None else key, expected)
         if len(values) != 1:
@@ -137,11 +137,11 @@ class Entry:
 
 
 def numbers_of(value: Any, depth: int = 0) -> list[float] | None:
-    """The numbers of a list, a list of lists, an OpenCV matrix or text; None where there are others than numbers."""
+    """Numbers from a list, a list of lists, an OpenCV matrix or text; None if anything is not a number."""
     if isinstance(value, Mapping):
         value = value.get("data")
     if isinstance(value, str) and depth < 2:
-        # XML's, and those that YAML takes for text, such as 1e-05.
+        # XML text, and numbers that YAML reads as text, such as 1e-05.
         try:
             return [float(word) for word in value.split()] or None
         except ValueError:

@@ -1,4 +1,4 @@
-"""Other people's recordings to scene folders; sources are only read, and everything left out is counted."""
+"""Convert foreign recordings to scene folders; sources are never changed, and everything left out is counted."""
 
 from __future__ import annotations
 
@@ -56,38 +56,37 @@ Format = Literal[
 
 @dataclass(frozen=True)
 class ProcessSettings:
-    """What a scene is made of, as far as the source does not say."""
+    """Scene settings that the source does not provide."""
 
     trajectory: Path | None = None
-    """Initial keyframe poses; the reference itself where not given."""
+    """Initial keyframe poses; by default the reference."""
     trajectory_format: TrajectoryFormat = field(default_factory=TrajectoryFormat)
-    """What that file does not say of itself; of the reference where there is no other trajectory."""
+    """Conventions of that file, if it does not give them; without --trajectory, those of the reference."""
     groundtruth: Path | None = None
-    """Reference poses, where the dataset's folder has none; of the event camera, on its clock."""
+    """Reference poses of the event camera, on its clock, if the dataset's folder has none."""
     camera: Path | None = None
-    """A calibration file, in place of the one in the dataset's folder."""
+    """A calibration file that replaces the one in the dataset's folder."""
     camera_name: str | None = None
-    """Which camera of that file; TUM-VIE's event cameras are known."""
+    """Which camera of that file; not needed for TUM-VIE's event cameras."""
     sensor_size: tuple[int, int] | None = None
-    """Columns and rows, where neither recording nor calibration say so."""
+    """Columns and rows, if given by neither recording nor calibration."""
     contrast_threshold: tuple[float, float] | None = None
-    """On and off, where known."""
+    """ON and OFF thresholds, if known."""
     part: str | None = None
-    """The group of an HDF5 file, the topic of a bag or the array of an npz or mat file that has the events, where
-    several have; of TUM-VIE's event cameras left or right."""
+    """The group of an HDF5 file, the topic of a bag or the array of an npz or mat file with the events, if there are
+    several; left or right for TUM-VIE."""
     event_time_unit: TimeUnit | None = None
-    """Of the events in text, HDF5, npz, npy and mat files, where they do not say so."""
+    """Unit of event times in text, HDF5, npz, npy and mat files, if they do not give it."""
     event_columns: str | None = None
-    """Order of the columns of such files where they have no names, such as 'x y p t'; told by their values where not
-    given."""
+    """Order of unnamed columns in such files, such as 'x y p t'; by default inferred from their values."""
     events: Intake = field(default_factory=Intake)
-    """What to do with events."""
+    """Filters and repairs of events."""
     bounds: Bounds | None = None
-    """Lower and upper corner of the scene in the trajectory's unit, where known."""
+    """Lower and upper corner of the scene in the trajectory's unit, if known."""
     farthest: float | None = None
-    """Bounds that hold everything in view up to this distance, in the trajectory's unit."""
+    """Set bounds that contain everything in view up to this distance, in the trajectory's unit."""
     frames: bool = True
-    """Take along the frames that the dataset has."""
+    """Import the dataset's frames."""
 
 
 def process(
@@ -97,9 +96,9 @@ def process(
     settings: ProcessSettings,
     progress: Callable[[int], None] = lambda events: None,
 ) -> list[str]:
-    """Make a scene folder, and say what was read, recognised, repaired and left out.
+    """Make a scene folder; returns notes on what was read, recognised, repaired and left out.
 
-    Raises the error of whatever room finds something wrong, in which case there is no folder.
+    Raises one of the package's errors, in which case no folder is written.
     """
     _check(settings)
     with _unpacked(source) as unpacked:
@@ -109,7 +108,7 @@ def process(
 
 
 def _check(settings: ProcessSettings) -> None:
-    """Raise :class:`SceneError` for numbers that no scene can have, before anything is read."""
+    """Raise :class:`SceneError` for impossible numbers before anything is read."""
     on, off = settings.contrast_threshold or (None, None)
     numbers = {"--contrast-threshold ON": on, "--contrast-threshold OFF": off, "--farthest": settings.farthest}
     for flag, value in numbers.items():
@@ -121,7 +120,7 @@ def _check(settings: ProcessSettings) -> None:
 
 @contextmanager
 def _unpacked(source: Path) -> Iterator[Path]:
-    """The source, or what is in it where it is a zip file of a dataset."""
+    """The source, unpacked if it is a zip file of a dataset."""
     if source.suffix != ".zip" or not source.exists():
         yield source
         return
@@ -131,7 +130,7 @@ def _unpacked(source: Path) -> Iterator[Path]:
                 archive.extractall(folder)
         except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
             raise SceneError(f"{source}: not a whole zip file that can be opened ({error})") from None
-        # Some systems leave notes of their own beside the dataset's folder.
+        # Some systems add metadata next to the dataset's folder.
         inside = [one for one in Path(folder).iterdir() if one.name != "__MACOSX" and not one.name.startswith(".")]
         yield inside[0] if len(inside) == 1 and inside[0].is_dir() else Path(folder)
 
@@ -158,7 +157,7 @@ def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ing
 
 
 def _layout(format: Format, source: Path) -> Layout | None:
-    """The dataset that a folder is; none where it is a bag, or has but files of events."""
+    """The dataset layout of a folder; None for a bag or a folder with only event files."""
     if format in LAYOUTS:
         return format  # pyright: ignore[reportReturnType]
     if format != "auto" or not source.is_dir() or (source / "metadata.yaml").is_file():
@@ -174,7 +173,7 @@ def _layout(format: Format, source: Path) -> Layout | None:
 def _frames_within(
     source: Path, format: RecordingFormat, opened: Callable[[], Source], part: str | None, left_out: Counter[str]
 ) -> Iterator[FrameFile]:
-    """The pictures that a DAVIS takes with the pixels of its events."""
+    """Frames that a DAVIS takes with the same pixels as its events."""
     if format == "aedat4":
         from ebarf_ns.formats.readers.aedat4 import read_aedat4_frames
 
@@ -190,7 +189,7 @@ def _frames_within(
 
 
 def _grey(picture: np.ndarray) -> np.ndarray:
-    """Of grey, BGR or BGRA."""
+    """Grey image from grey, BGR or BGRA."""
     channels = 1 if picture.ndim == 2 else picture.shape[2]
     if channels == 1:
         return picture.reshape(picture.shape[:2])
@@ -219,7 +218,7 @@ def _assemble(
     groundtruth = ingredients.groundtruth
     if settings.groundtruth:
         known = settings.trajectory_format
-        # What the flags say is of the other file then, but for the times, which are of those that have none.
+        # With --trajectory, the format flags apply to that file, except --pose-times, for files without times.
         known = TrajectoryFormat(pose_times=known.pose_times) if settings.trajectory else known
         groundtruth, said = read_trajectory(settings.groundtruth, known, span_us)
         notes += said
@@ -231,9 +230,9 @@ def _assemble(
         notes.append("no trajectory: ebarf trajectory estimate SCENE makes one from the events, as does training")
     else:
         notes += doubts(source, span_us, initial, intake.time_offset_us)
-        # Who cut out a window, or said the events' unit, is told, not stopped.
-        meant = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
-        notes += apart(initial, span_us, settings.trajectory or source.path, meant)
+        # With a time window or a given unit of event times, a mismatch is only a note.
+        intended = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
+        notes += apart(initial, span_us, settings.trajectory or source.path, intended)
         initial = clipped(initial, span_us, settings.trajectory or source.path)
         notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
         write_tum(folder / "trajectory.txt", initial)
@@ -246,11 +245,11 @@ def _assemble(
         frame = replace(frame, t_us=frame.t_us + intake.time_offset_us)  # noqa: PLW2901
         if span_us[0] <= frame.t_us <= span_us[1]:
             within += 1
-            taken = _taken_along(frame, f"{seen:06d}", whole, intake.crop, folder)
-            if isinstance(taken, Frame):
-                frames.append(taken)
+            copied = _copied_frame(frame, f"{seen:06d}", whole, intake.crop, folder)
+            if isinstance(copied, Frame):
+                frames.append(copied)
             else:
-                left_out[taken] += 1
+                left_out[copied] += 1
         seen += 1
     notes += [f"left out: {count:,} frame{'s' * (count > 1)} of {why}" for why, count in left_out.items()]
     scene = Scene(
@@ -267,10 +266,10 @@ def _assemble(
     write_scene(scene)
     contradicted = polarity_contradicted(polarity_correlations(scene))
     notes += [f"suspicious: {contradicted}"] if contradicted else []
-    taken_along = "" if len(frames) == within else f", {len(frames)} of which are taken along"
+    imported = "" if len(frames) == within else f", {len(frames)} imported"
     notes.append(
         f"{len(initial.t_us) if initial else 'no'} keyframes around the events, "
-        f"{within} of {seen} frames within their span{taken_along}"
+        f"{within} of {seen} frames within their span{imported}"
     )
     return report.sentences() + notes
 
@@ -286,8 +285,8 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
         )
     if said is not None and said != (camera.width, camera.height):
         raise SceneError(
-            f"the recording says its sensor has {said[0]} x {said[1]} pixels, the calibration {camera.width} x "
-            f"{camera.height}; expected those of one camera"
+            f"the recording gives a sensor size of {said[0]} x {said[1]} pixels, the calibration {camera.width} x "
+            f"{camera.height}; expected both to be of one camera"
         )
     return camera
 
@@ -295,14 +294,14 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
 def _initial(
     path: Path, known: TrajectoryFormat, groundtruth: Trajectory | None, span_us: tuple[int, int]
 ) -> tuple[Trajectory, list[str]]:
-    """As the file says; the order of quaternions that it does not say, the reference tells where there is one."""
+    """Read the initial trajectory; a quaternion order that the file does not give is inferred from the reference."""
     if groundtruth is None:
         return read_trajectory(path, known, span_us)
     return read_beside_reference(path, groundtruth, known, span_us)
 
 
 def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Corners of a box around the cameras and all that they see up to a distance."""
+    """Corners of a box around the cameras and everything in view up to a distance."""
     corners = torch.tensor(
         [
             [x, y]
@@ -317,10 +316,10 @@ def _seen(trajectory: Trajectory, camera: Camera, farthest: float) -> tuple[tupl
     return tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
 
 
-def _taken_along(frame: FrameFile, name: str, camera: Camera, crop: Crop | None, folder: Path) -> Frame | str:
-    """A copy: PNG where the scene can hold it as it is; of what size a frame is that its camera cannot have taken.
+def _copied_frame(frame: FrameFile, name: str, camera: Camera, crop: Crop | None, folder: Path) -> Frame | str:
+    """Copy a frame, a PNG unchanged; returns the reason if its size does not match its camera.
 
-    Frames of the event camera itself are cropped with it.
+    Frames of the event camera are cropped with it.
     """
     crop = crop if frame.camera is None else None
     picture = frame.picture

@@ -1,4 +1,4 @@
-"""What is in a recording as its camera or its authors left it, before there is a scene."""
+"""Inspection of a raw recording, before it becomes a scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,29 +22,29 @@ _BARS = " ▁▂▃▄▅▆▇█"
 
 @dataclass(frozen=True)
 class RawSummary:
-    """Numbers of a recording; ``suspicions`` are sentences for a person."""
+    """Statistics of a recording; ``suspicions`` are sentences for the user."""
 
     format: str
     events: int
     width: int
     height: int
     sensor_size_said: bool
-    """Whether the file says so; else it is the smallest sensor that holds all events."""
+    """Whether the file gives the size; else it is the smallest that contains all events."""
     start_us: int
     end_us: int
     events_per_second: float
     busiest_events_per_second: float
-    """In the busiest tenth of a second."""
+    """Rate in the busiest tenth of a second."""
     brighter_share: float
     hottest_pixels: list[tuple[int, int, int]]
-    """Column, row and events of some, the busiest first."""
+    """Column, row and event count, the busiest first."""
     rate: list[int]
-    """Events in each of some equal parts of the recording's time."""
+    """Events in equal parts of the recording's time."""
     suspicions: list[str] = field(default_factory=list)
 
 
 def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> RawSummary:
-    """Read a recording once; raises :class:`RecordingError` where its reader cannot go on."""
+    """Read a recording once and summarise it; raises :class:`RecordingError` if it cannot be read."""
     source = open_events()
     counts = np.zeros((1, 1), np.int64)
     slots: dict[int, int] = {}
@@ -89,7 +89,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
 
 
 def _count(path: Path, counts: np.ndarray, piece: Piece) -> np.ndarray:
-    """The events of each pixel, in an array as large as there are coordinates."""
+    """Add a piece to the event counts per pixel, growing the array to fit all coordinates."""
     x, y = piece.x.astype(np.int64), piece.y.astype(np.int64)
     width, height = max(int(x.max()) + 1, counts.shape[1]), max(int(y.max()) + 1, counts.shape[0])
     if min(int(x.min()), int(y.min())) < 0 or max(width, height) > _LARGEST_SENSOR:
@@ -126,7 +126,7 @@ def _suspicions(source: Source, counts: np.ndarray, brighter: float, late: int) 
 
 
 def _doubts(source: Source, events: int, moments: int, span_us: int) -> list[str]:
-    """Of times whose unit was guessed: milliseconds and numbers of frames are few and close together."""
+    """Doubts about a guessed time unit: milliseconds and frame numbers give few distinct, close times."""
     if not source.guessed_unit or span_us >= _SHORTEST_US or events < _FEW_A_MOMENT * moments:
         return []
     return [
@@ -136,7 +136,7 @@ def _doubts(source: Source, events: int, moments: int, span_us: int) -> list[str
 
 
 def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output: Path) -> None:
-    """Pictures of the events of 20 ms each, evenly over the recording, as one PNG."""
+    """Write one PNG with evenly spaced event images of 20 ms each."""
     middles = np.linspace(summary.start_us, summary.end_us, 2 * _PICTURES + 1)[1::2]
     starts = (middles - _PICTURE_US / 2).astype(np.int64)
     pictures = np.zeros((_PICTURES, summary.height, summary.width), np.int64)
@@ -155,7 +155,7 @@ def contact_sheet(open_events: Callable[[], Source], summary: RawSummary, output
 
 
 def print_raw_summary(summary: RawSummary, path: Path) -> None:
-    """For a person: first what looks wrong."""
+    """Print the summary, suspicions first."""
     seconds = (summary.end_us - summary.start_us) * 1e-6
     size = f"{summary.width} x {summary.height}"
     most = max(1, *summary.rate)

@@ -1,4 +1,4 @@
-"""Poses as a file has them, before its conventions are applied, and what to know of them where it does not say."""
+"""Poses as stored in a file, before conventions are applied, and the conventions that a file may not give."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ Transform = Literal["camera-to-world", "world-to-camera"]
 Axes = Literal["opencv", "opengl", "llff"]
 
 _UNIT_LENGTH = 1e-3
-"""Further off unit length than this is a different mistake than rounding."""
+"""A larger deviation from unit length is not rounding."""
 _DIGITS = 30
 
 
 @dataclass(frozen=True)
 class TrajectoryFormat:
-    """What to know of a trajectory's file where the file itself does not say."""
+    """Conventions of a trajectory file, for what the file does not give."""
 
     pose_time_unit: TimeUnit | None = None
-    """Of its times; recognised from their spacing where not given."""
+    """Unit of the times; by default recognised from their spacing."""
     quaternion: Quaternion | None = None
-    """Order of the quaternion's columns: TUM's xyzw, wxyz, or the yzwx of some files of DEVO and DEIO."""
+    """Order of the quaternion columns: TUM's xyzw, wxyz, or the yzwx of some files of DEVO and DEIO."""
     transform: Transform | None = None
-    """Of its poses; COLMAP's are world-to-camera, all others camera-to-world where not given."""
+    """Direction of the poses; by default world-to-camera for COLMAP and camera-to-world for all others."""
     axes: Axes | None = None
-    """Of its cameras; LLFF's are its own, all others OpenCV's where not given."""
+    """Camera axes; by default LLFF's for LLFF and OpenCV's for all others."""
     pose_times: Path | None = None
-    """A time for each pose, for files without (KITTI, LLFF, COLMAP): a line each, "time" or "name time"."""
+    """File with a time per pose, for formats without times (KITTI, LLFF, COLMAP): lines "time" or "name time"."""
 
 
 NOTHING_KNOWN = TrajectoryFormat()
@@ -52,28 +52,28 @@ class RawPoses:
     rotation: Float[np.ndarray, "poses 4"] | Float[np.ndarray, "poses 3 3"]
     """Quaternions in the file's order, or matrices."""
     quaternion: Quaternion | None = None
-    """As the file or its format has it; None: it does not say."""
+    """Order given by the file or its format; None: not given."""
     transform: Transform = "camera-to-world"
     axes: Axes = "opencv"
     time_unit: TimeUnit | None = None
     pointed: bool = False
     """Whether times are written with a decimal point."""
     places: tuple[str, ...] = ()
-    """Where each pose stands, for messages; the line of a text file."""
+    """Location of each pose for messages, such as the line of a text file."""
     notes: tuple[str, ...] = ()
 
     def place(self, path: Path, pose: int) -> str:
-        """Of a pose, as messages begin."""
+        """Location of a pose for messages."""
         return self.places[pose] if self.places else f"{path}: pose {pose}"
 
     @property
     def order_told(self) -> bool:
-        """Whether the file tells the order of its quaternions, or needs none."""
+        """Whether the file gives the order of its quaternions, or needs none."""
         return self.rotation.ndim == 3 or self.quaternion is not None
 
 
 def number(text: str) -> Decimal | None:
-    """A finite number of no absurd size, or None."""
+    """Parse a finite number of reasonable size, or return None."""
     try:
         value = Decimal(text)
     except InvalidOperation:
@@ -82,7 +82,7 @@ def number(text: str) -> Decimal | None:
 
 
 def check_lengths(quaternions: Float[np.ndarray, "poses 4"], places: Sequence[str]) -> None:
-    """Raise :class:`TrajectoryError` where one is not of unit length."""
+    """Raise :class:`TrajectoryError` unless all quaternions have unit length."""
     length = np.linalg.norm(quaternions, axis=1)
     if (wrong := np.abs(length - 1) > _UNIT_LENGTH).any():
         k = int(wrong.argmax())
@@ -92,21 +92,21 @@ def check_lengths(quaternions: Float[np.ndarray, "poses 4"], places: Sequence[st
 def rotations(
     path: Path, matrices: Float[np.ndarray, "poses 3 3"], places: tuple[str, ...] = ()
 ) -> Float[np.ndarray, "poses 3 3"]:
-    """The matrices; raises :class:`TrajectoryError` where one is no rotation."""
+    """Return the matrices; raises :class:`TrajectoryError` if one is not a rotation."""
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     wrong = ~(off <= 10 * _UNIT_LENGTH)
     wrong[~wrong] = np.linalg.det(matrices[~wrong]) < 0
     if wrong.any():
         k = int(wrong.argmax())
         place = f"{places[k]}: the matrix" if places else f"{path}: the matrix of pose {k}"
-        raise TrajectoryError(f"{place} is no rotation (off by {off[k]:.3g}), expected one")
+        raise TrajectoryError(f"{place} is not a rotation (off by {off[k]:.3g}), expected one")
     return matrices
 
 
 def moving(
     path: Path, matrices: Float[np.ndarray, "poses rows 4"], places: tuple[str, ...] = ()
 ) -> tuple[Float[np.ndarray, "poses 3"], Float[np.ndarray, "poses 3 3"]]:
-    """Positions and rotations of 3x4 or 4x4 matrices, the last row of which is 0 0 0 1."""
+    """Positions and rotations of 3x4 or 4x4 matrices; the last row of the latter must be 0 0 0 1."""
     if matrices.shape[1] == 4:
         wrong = ~(np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= _UNIT_LENGTH).all(axis=1)
         if wrong.any():
@@ -120,7 +120,7 @@ def moving(
 
 
 def times_beside(path: Path, count: int, names: list[str] | None, known: TrajectoryFormat) -> list[Decimal]:
-    """From the file that has them, by name where it has names."""
+    """Times from the ``pose_times`` file, matched by name if it has names."""
     if known.pose_times is None:
         raise TrajectoryError(f"{path}: has no times, expected --pose-times with a line for each of its {count} poses")
     times = _listed(known.pose_times)
@@ -134,7 +134,7 @@ def times_beside(path: Path, count: int, names: list[str] | None, known: Traject
 
 
 def _listed(path: Path) -> dict[str, Decimal]:
-    """Times by name, or by number where there are no names."""
+    """Times by name, or by index without names."""
     times: dict[str, Decimal] = {}
     try:
         if path.suffix == ".npy":
@@ -142,18 +142,18 @@ def _listed(path: Path) -> dict[str, Decimal]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError, InvalidOperation) as error:
         reason = getattr(error, "strerror", None) or error
-        raise TrajectoryError(f"{path}: cannot be read ({reason}), expected a time a line") from None
+        raise TrajectoryError(f"{path}: cannot be read ({reason}), expected one time per line") from None
     first = True
     for line_number, line in enumerate(lines, start=1):
         fields = line.split("#")[0].replace(",", " ").split()
         if not fields:
             continue
-        # "time", "name time", where the name may be a number, or "time name".
+        # "time", "time name", or "name time", whose name may be a number.
         values = [number(field) for field in fields[:2]]
         place = len(values) - 1 if values[-1] is not None else 0
         time = values[place]
         if time is None:
-            # A line of names has no digit in front.
+            # The fields of a header line do not begin with a digit.
             if first and not any(field[0].isdigit() for field in fields[:2]):
                 first = False
                 continue

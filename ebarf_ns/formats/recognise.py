@@ -1,4 +1,4 @@
-"""A recording's format, by what its file begins with."""
+"""Recognise a recording's format from the first bytes of its file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ebarf_ns.errors import RecordingError, did_you_mean
+from ebarf_ns.files import is_special
 from ebarf_ns.formats.columns import parsed_order
 from ebarf_ns.formats.readers.text import read_text
 from ebarf_ns.formats.source import Source, TimeUnit
@@ -26,10 +27,10 @@ def open_recording(
     time_unit: TimeUnit | None = None,
     columns: str | None = None,
 ) -> Source:
-    """A recording of any format; ``part`` is the group of an HDF5 file, the topic of a bag or the array of a file of
-    arrays, where there are several; ``columns`` is the order of columns without names, as in ``x y p t``.
+    """Open a recording of any format; ``part`` selects the group of an HDF5 file, the topic of a bag or the array of an
+    array file, if there are several; ``columns`` is the order of unnamed columns, as in ``x y p t``.
 
-    Raises :class:`RecordingError` where it cannot be opened or is none.
+    Raises :class:`RecordingError` if it cannot be opened or is not a recording.
     """
     order = parsed_order(columns) if columns is not None else None
     source = _opened(path, known or recognised(path), part, time_unit, order)
@@ -41,7 +42,7 @@ def open_recording(
 def _opened(
     path: Path, found: RecordingFormat, part: str | None, time_unit: TimeUnit | None, order: str | None
 ) -> Source:
-    # Some of the libraries take long to import, and each file needs one of them.
+    # Some libraries are slow to import, and each file needs only one.
     if found == "hdf5":
         from ebarf_ns.formats.readers.hdf5 import read_hdf5
 
@@ -68,7 +69,7 @@ def _opened(
 
 
 def recognised_folder(path: Path) -> RecordingFormat | None:
-    """The recording that a folder is, if it is one."""
+    """The format of a folder, if it is a recording."""
     if (path / "metadata.yaml").is_file():
         return "bag"
     kinds: tuple[RecordingFormat, ...] = ("npy", "npz")
@@ -76,13 +77,15 @@ def recognised_folder(path: Path) -> RecordingFormat | None:
 
 
 def recognised(path: Path) -> RecordingFormat:
-    """What a file or folder is; raises :class:`RecordingError` where it is none of those."""
+    """The format of a file or folder; raises :class:`RecordingError` for unknown formats."""
     if path.is_dir():
         if found := recognised_folder(path):
             return found
         raise RecordingError(
             f"{path}: a folder without metadata.yaml (ROS 2), .npy or .npz files, expected a recording"
         )
+    if is_special(path):
+        raise RecordingError(f"{path}: a pipe or a device, expected a file")
     try:
         with path.open("rb") as file:
             beginning = file.read(_BEGINNING)

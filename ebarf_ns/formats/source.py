@@ -1,4 +1,4 @@
-"""A recording of any format as its reader hands it on: what the header says, and the events piece by piece."""
+"""A recording of any format as delivered by its reader: header information and pieces of events."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 DECIMALS: dict[TimeUnit, int] = {"s": 6, "ms": 3, "us": 0, "ns": -3}
-"""By which power of ten a time becomes microseconds."""
+"""Power of ten that converts a time to microseconds."""
 _LATEST_US = 1e18
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some events in the file's order; that they are integers is all that is sure of them."""
+    """Some events in file order; only their integer type has been checked."""
 
     x: Shaped[np.ndarray, "events"]
     y: Shaped[np.ndarray, "events"]
     t_us: Int64[np.ndarray, "events"]
     polarity: Shaped[np.ndarray, "events"]
-    """As the file has it: 0 and 1, or -1 and 1."""
+    """As in the file: 0 and 1, or -1 and 1."""
     place: Callable[[int], str]
-    """Where in the file an event of this piece is, for people."""
+    """Location of an event of this piece in the file, for messages."""
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -37,31 +37,31 @@ class Piece:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording that can be read once, from beginning to end, a piece at a time."""
+    """A recording that can be read once, sequentially, in pieces."""
 
     path: Path
     format: str
-    """What it was recognised as, for people."""
+    """The recognised format, as text for the user."""
     sensor_size: tuple[int, int] | None
-    """Columns and rows, where the file says so."""
+    """Columns and rows, if the file gives them."""
     pieces: Iterator[Piece]
     dropped: Counter[str] = field(default_factory=Counter)
-    """Events that the file hints at but does not hold in full, by reason; counted while reading."""
+    """Number of events that are incomplete in the file, by reason; counted while reading."""
     notes: tuple[str, ...] = ()
-    """What was found out of columns and times, for people."""
+    """Inferred properties of columns and times, as text for the user."""
     guessed_unit: TimeUnit | None = None
-    """Of the times, where nothing but their look says so."""
+    """Unit of the times, if it was only guessed from their values."""
     columns: str = ""
-    """Their order, a letter each, where they have no names."""
+    """Order of unnamed columns, one letter each."""
 
 
 def fits(t: Num[np.ndarray, "events"], unit: TimeUnit) -> Bool[np.ndarray, "events"]:
-    """Whether times of that unit can be microseconds in 64 bits; not where they are not finite."""
+    """Whether times are finite and fit 64-bit microseconds."""
     return np.abs(t.astype(np.float64)) * 10.0 ** DECIMALS[unit] <= _LATEST_US
 
 
 def microseconds(t: Num[np.ndarray, "events"], unit: TimeUnit) -> Int64[np.ndarray, "events"]:
-    """Times in a unit, rounded to the nearest; exact for integers."""
+    """Convert times to microseconds, rounded to the nearest; exact for integers."""
     decimals = DECIMALS[unit]
     if t.dtype.kind == "f":
         return np.rint(t.astype(np.float64) * 10.0**decimals).astype(np.int64)
@@ -72,5 +72,5 @@ def microseconds(t: Num[np.ndarray, "events"], unit: TimeUnit) -> Int64[np.ndarr
 
 
 def numbered(first: int, word: str = "event") -> Callable[[int], str]:
-    """A :attr:`Piece.place` that counts from ``first``."""
+    """A :attr:`Piece.place` that numbers events from ``first``."""
     return lambda k: f"{word} {first + k:,}"

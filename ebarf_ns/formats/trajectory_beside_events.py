@@ -1,4 +1,4 @@
-"""Whether a trajectory and a recording belong together: units of time, overlap."""
+"""Checks that a trajectory and a recording belong together: time units and overlap."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from ebarf_ns.errors import RecordingError, TrajectoryError
 from ebarf_ns.formats.source import DECIMALS, Source, TimeUnit
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
 
-# A trajectory this much longer than its recording, with no two poses among the events, is in another unit of time.
+# A trajectory this many times longer than its recording, with fewer than two poses in it, has another time unit.
 _LONGEST_SPAN_RATIO = 100
 _FEW_KEYFRAMES, _SHORT_SHARE, _MUCH_LONGER = 4, 0.5, 500
 
 
 def doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, offset_us: int) -> list[str]:
-    """What looks wrong of times in a guessed unit, beside the trajectory; an error where another unit looks right."""
+    """Doubts about a guessed event time unit, given the trajectory; raises an error if another unit fits."""
     unit = source.guessed_unit
     if unit is None or _beside(span_us, trajectory):
         return []
@@ -34,12 +34,12 @@ def doubts(source: Source, span_us: tuple[int, int], trajectory: Trajectory, off
             f"{source.path}: {doubt}; expected --event-time-unit with {' or '.join(others)}, or {unit} if it is right, "
             "or another --pose-time-unit"
         )
-    return [f"suspicious: {doubt}; --event-time-unit says another unit"]
+    return [f"suspicious: {doubt}; --event-time-unit sets another unit"]
 
 
 def _beside(span_us: tuple[int, ...], trajectory: Trajectory) -> bool:
-    """Whether events and trajectory overlap, and neither is many hundred times as long as the other, nor the events
-    shorter than the time between keyframes."""
+    """Whether events and trajectory overlap, have comparable durations (within a factor of 500), and the events are not
+    shorter than half the keyframe spacing."""
     first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
     if min(span_us[1], last_us) <= max(span_us[0], first_us):
         return False
@@ -50,7 +50,7 @@ def _beside(span_us: tuple[int, ...], trajectory: Trajectory) -> bool:
 
 
 def clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Trajectory:
-    """The poses within the events' span, and one more at either end."""
+    """The poses within the span of the events, plus one at either end."""
     first, last = torch.searchsorted(trajectory.t_us, torch.tensor(span_us)).tolist()
     chosen = slice(max(first - 1, 0), last + 1)
     clipped = Trajectory(trajectory.t_us[chosen], Poses(*(column[chosen] for column in trajectory.poses)))
@@ -62,14 +62,14 @@ def clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Tra
     return clipped
 
 
-def apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, meant: bool) -> list[str]:
-    """What is odd where all events lie between two poses; raises :class:`TrajectoryError` where nothing explains it."""
+def apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, intended: bool) -> list[str]:
+    """Note if all events lie between two poses; raises :class:`TrajectoryError` unless this is ``intended``."""
     t_us, events_s = trajectory.t_us, (span_us[1] - span_us[0]) * 1e-6
     among = int(within_span(t_us, torch.tensor(span_us)).sum())
     poses_s = float(t_us[-1] - t_us[0]) * 1e-6
     if among >= 2 or not bool(within_span(torch.tensor(span_us), t_us).any()):
         return []
     said = f"{path}: the {len(t_us)} poses span {poses_s:g} s, with {among} of them among the events, which span "
-    if poses_s > _LONGEST_SPAN_RATIO * events_s and not meant:
+    if poses_s > _LONGEST_SPAN_RATIO * events_s and not intended:
         raise TrajectoryError(f"{said}{events_s:g} s; expected one unit of time: --event-time-unit or --pose-time-unit")
     return [f"{said}{events_s:g} s: times in another unit? (--event-time-unit, --pose-time-unit)"]

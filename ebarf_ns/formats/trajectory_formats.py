@@ -1,7 +1,7 @@
-"""Trajectories as other programs write them, into ours: int64 microseconds, camera to world, OpenCV axes.
+"""Read trajectories of other programs, converted to int64 microseconds, camera-to-world, OpenCV axes.
 
-What a file says is taken; what can be recognised is, and is reported; what cannot is asked for by an option. The order
-of a quaternion's columns cannot: every order is a rotation as smooth as the right one.
+Conventions given in a file are used; others are recognised and reported if possible, or asked for by an option. The
+order of quaternion columns cannot be recognised: every order gives an equally smooth rotation.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ __all__ = [
     "trajectory_of",
 ]
 
-# Of the file's axes, what x, y and z of OpenCV are: LLFF has down, right, back.
+# OpenCV's x, y and z axes as columns, in the axes of the file: LLFF has down, right, back.
 _AXES: dict[Axes, np.ndarray] = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
@@ -59,12 +59,12 @@ _AXES: dict[Axes, np.ndarray] = {
 def read_trajectory(
     path: Path, known: TrajectoryFormat = NOTHING_KNOWN, span_us: tuple[int, int] | None = None
 ) -> tuple[Trajectory, list[str]]:
-    """Poses in order of time, and what was recognised; raises :class:`TrajectoryError`.
+    """Read poses, sorted by time, and notes on what was recognised; raises :class:`TrajectoryError`.
 
     TUM text in any unit, text with a line that names its columns, TUM-VIE's ``mocap_data.txt``, EuRoC's ``data.csv``,
     EDS' ground truth, KITTI, COLMAP's ``images.txt`` and ``images.bin`` (or the folder of either), matrices as npy,
-    LLFF's ``poses_bounds.npy``, Robust e-NeRF's ``camera_poses.npz``, M3ED's ``*_pose_gt.h5``. ``span_us`` is of what
-    the poses are for, and helps to tell the unit of their times.
+    LLFF's ``poses_bounds.npy``, Robust e-NeRF's ``camera_poses.npz``, M3ED's ``*_pose_gt.h5``. ``span_us``, the span of
+    the events or a reference, helps to recognise the time unit.
     """
     return trajectory_of(path, read_raw(path, known), known, span_us)
 
@@ -72,7 +72,7 @@ def read_trajectory(
 def trajectory_of(
     path: Path, raw: RawPoses, known: TrajectoryFormat = NOTHING_KNOWN, span_us: tuple[int, int] | None = None
 ) -> tuple[Trajectory, list[str]]:
-    """What :func:`read_trajectory` makes of a file that was read."""
+    """Convert raw poses, see :func:`read_trajectory`."""
     _check_numbers(path, raw)
     unit = known.pose_time_unit or raw.time_unit or recognised_unit(path, raw.times, span_us)
     quaternion, doubtful = known.quaternion or raw.quaternion, False
@@ -109,15 +109,15 @@ def trajectory_of(
 def order_is_doubtful(
     path: Path, raw: RawPoses, known: TrajectoryFormat, span_us: tuple[int, int] | None = None
 ) -> bool:
-    """Whether the order of quaternions has to be asked for: microseconds written as floats, without names, are the
-    mark of one family of odometry."""
+    """Whether the quaternion order is ambiguous: microseconds written as floats, without column names, are typical of
+    one family of odometry."""
     if raw.order_told or known.quaternion or not raw.pointed:
         return False
     return (known.pose_time_unit or raw.time_unit or recognised_unit(path, raw.times, span_us)) == "us"
 
 
 def _check_numbers(path: Path, raw: RawPoses) -> None:
-    """Raise :class:`TrajectoryError` unless there are two poses or more of finite numbers, each at its own time."""
+    """Raise :class:`TrajectoryError` unless there are at least two poses of finite numbers, with distinct times."""
     if len(raw.times) < 2:
         raise TrajectoryError(f"{path}: holds {len(raw.times)} pose{'s'[: not raw.times]}, expected 2 or more")
     values = np.concatenate([raw.position, raw.rotation.reshape(len(raw.times), -1)], axis=1)
@@ -156,7 +156,7 @@ def _camera_to_world(raw: RawPoses, quaternion: Quaternion | None, transform: Tr
 
 
 def read_raw(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> RawPoses:
-    """A file's content; raises :class:`TrajectoryError`."""
+    """Read a file without applying conventions; raises :class:`TrajectoryError`."""
     if path.is_dir():
         models = [path / name for name in ("images.bin", "images.txt") if (path / name).is_file()]
         if not models:
@@ -188,7 +188,7 @@ def _robust_e_nerf(path: Path) -> RawPoses:
 
 
 def _m3ed(path: Path) -> RawPoses:
-    """Chaney et al. 2023: ``Cn_T_C0`` brings points of the first event camera, which is the world, into the n-th."""
+    """M3ED (Chaney et al. 2023): ``Cn_T_C0`` maps points from the first event camera, the world frame, to the n-th."""
     with h5py.File(path, "r") as file:
         matrices, times = np.asarray(file["Cn_T_C0"], float), np.asarray(file["ts"])
     if matrices.shape != (len(times), 4, 4):
@@ -199,7 +199,7 @@ def _m3ed(path: Path) -> RawPoses:
 
 
 def _npy(path: Path, known: TrajectoryFormat) -> RawPoses:
-    """LLFF's table, or matrices, flat or not."""
+    """LLFF's table, or flat or stacked matrices."""
     table = np.load(path).astype(float)
     shape, count = table.shape, len(table) if table.ndim else 0
     if shape[1:] == (3, 5):
@@ -220,7 +220,7 @@ def _npy(path: Path, known: TrajectoryFormat) -> RawPoses:
 
 
 Images = list[tuple[str, list[float]]]
-"""COLMAP's: names, and qw qx qy qz tx ty tz of the world in the camera."""
+"""COLMAP images: name, and world-to-camera qw qx qy qz tx ty tz."""
 
 
 def _colmap(path: Path, images: Images, known: TrajectoryFormat) -> RawPoses:
@@ -233,7 +233,7 @@ def _colmap(path: Path, images: Images, known: TrajectoryFormat) -> RawPoses:
 
 
 def _colmap_text(path: Path, lines: list[str]) -> Images:
-    """Two lines an image, of which the second lists its points, and may be empty."""
+    """Two lines per image; the second lists its points and may be empty."""
     lines = [line for line in lines if not line.startswith("#")]
     images = []
     for number, line in enumerate(lines[::2]):

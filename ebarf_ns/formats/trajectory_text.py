@@ -1,4 +1,4 @@
-"""Trajectories as text: columns by the names in a line above them, or as TUM and KITTI have them."""
+"""Trajectories as text: columns named in a header line, or in the layout of TUM or KITTI."""
 
 from __future__ import annotations
 
@@ -33,37 +33,37 @@ _UNITS: dict[TimeUnit, str] = {
     "ms": "ms|msecs?|millis?|milliseconds?",
     "s": "s|secs?|seconds?",
 }
-# A number that counts the lines stands before these.
+# Numbers of columns that may include a line counter in front.
 _COUNTED = (9, 14, 18)
 
 
 @dataclass(frozen=True)
 class _Table:
-    """Lines of fields, and where they stand."""
+    """Rows of fields and their line numbers."""
 
     rows: list[list[str]]
     lines: list[int]
     header: list[str]
-    """Comments and names above the first row."""
+    """Comments and header lines above the first row."""
 
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where the columns of a pose are."""
+    """Column indices of a pose."""
 
     time: int
     nanoseconds: int | None
-    """Of a time in two columns."""
+    """For times in two columns."""
     position: list[int]
     rotation: list[int]
     order: Quaternion
     unit: TimeUnit | None
     others: list[str]
-    """Names of all that is left out."""
+    """Names of unused columns."""
 
 
 def read_text(path: Path, lines: list[str], known: TrajectoryFormat) -> RawPoses:
-    """Columns that are named, TUM's eight, KITTI's twelve, or a 4x4 matrix, with or without a time before it."""
+    """Read named columns, TUM's eight, KITTI's twelve, or 4x4 matrices, with or without a time in front."""
     table = _table(path, lines)
     columns = _named(path, table)
     return _of_names(path, table, columns) if columns else _of_numbers(path, table, known)
@@ -96,19 +96,19 @@ def _table(path: Path, lines: list[str]) -> _Table:
 
 
 def _fields(text: str) -> list[str]:
-    """Between commas or semicolons, empty ones too, or between spaces."""
+    """Split at commas or semicolons, keeping empty fields, or at spaces."""
     text = text.strip()
     for separator in (";", ","):
         if separator in text:
             fields = [field.strip().strip("\"'") for field in text.split(separator)]
             if not any(len(field.split()) > 1 for field in fields):
-                # A separator at the end separates nothing.
+                # Ignore a trailing separator.
                 return fields[:-1] if not fields[-1] else fields
     return text.replace(",", " ").replace(";", " ").split()
 
 
 def _begun(field: str) -> bool:
-    """Whether a field is a number, or began as one; names begin with letters."""
+    """Whether a field is a number or begins like one; names begin with letters."""
     try:
         Decimal(field)
     except InvalidOperation:
@@ -117,7 +117,7 @@ def _begun(field: str) -> bool:
 
 
 def _named(path: Path, table: _Table) -> _Columns | None:
-    """By the last line above the poses that names their columns; None where none does."""
+    """Columns from the last header line that names them; None without one."""
     for line in reversed(table.header):
         units = [(match.start(), match.group(1)) for match in re.finditer(r"[\[(]([^\])]*)[\])]", line)]
         bare = re.sub(r"[\[(][^\])]*[\])]", lambda match: " " * len(match.group()), line)
@@ -135,7 +135,7 @@ def _named(path: Path, table: _Table) -> _Columns | None:
 
 
 def _columns(path: Path, names: list[str], unit: str) -> _Columns | None:
-    """The columns of a time, a position and a quaternion; None where names do not tell them."""
+    """Columns of time, position and quaternion; None if the names do not identify them."""
     clean = [re.sub(r"[^a-zµ0-9]+", "_", name.lower()).strip("_") for name in names]
     position = {axis: _matching(clean, _POSITION, axis) for axis in "xyz"}
     rotation = {axis: _matching(clean, _ROTATION, axis) for axis in "wxyz"}
@@ -143,7 +143,7 @@ def _columns(path: Path, names: list[str], unit: str) -> _Columns | None:
     seconds = [k for k, name in enumerate(clean) if _SECONDS.search(name)]
     paired = len(nanoseconds) == 1 and len(seconds) == 1
     times = seconds if paired else [k for k, name in enumerate(clean) if _TIME.search(name)]
-    # A message's own stamp goes before the time at which it was recorded.
+    # Prefer a message's own stamp to its recording time.
     times = [k for k in times if "stamp" in clean[k] and len(times) > 1] or times
     found = [times, *position.values(), *rotation.values()]
     if not all(found):
@@ -151,7 +151,7 @@ def _columns(path: Path, names: list[str], unit: str) -> _Columns | None:
     for columns in found:
         if len(columns) > 1:
             several = " and ".join(names[k] for k in columns)
-            raise TrajectoryError(f"{path}: columns {several} mean the same, expected one pose a line")
+            raise TrajectoryError(f"{path}: columns {several} mean the same, expected one pose per line")
     in_file = "".join(sorted(rotation, key=lambda axis: rotation[axis][0]))
     order: Quaternion = next((one for one in get_args(Quaternion) if one == in_file), "xyzw")
     used = [columns[0] for columns in found] + (nanoseconds if paired else [])
@@ -216,7 +216,7 @@ def _of_numbers(path: Path, table: _Table, known: TrajectoryFormat) -> RawPoses:
     if count in (12, 13, 16, 17):
         timed = count in (13, 17)
         numbers = np.array([row[timed:] for row in rows], float).reshape(len(rows), -1, 4)
-        # A frame's number is no time where there are times.
+        # With --pose-times, a counter in the first column is a frame number, not a time.
         numbered = timed and known.pose_times is not None and _counts(rows)
         own = timed and not numbered
         times = [row[0] for row in rows] if own else times_beside(path, len(rows), None, known)
@@ -238,7 +238,7 @@ def _numbers(path: Path, table: _Table, columns: list[int]) -> list[list[Decimal
         if len(row) < len(values):
             wrong = fields[columns[values.index(None)]]
             said = " ".join(fields)
-            raise TrajectoryError(f"{path}:{line}: {wrong!r:.40} in {said!r:.60} is no pose, expected numbers")
+            raise TrajectoryError(f"{path}:{line}: {wrong!r:.40} in {said!r:.60} is not a number, expected a pose")
         rows.append(row)
     return rows
 
@@ -248,7 +248,7 @@ def _places(path: Path, table: _Table) -> tuple[str, ...]:
 
 
 def _counts(rows: list[list[Decimal]]) -> bool:
-    """Whether the first column counts the rows, from any number on."""
+    """Whether the first column counts the rows, starting at any number."""
     numbers = [row[0] for row in rows]
     return all(value == numbers[0] + k for k, value in enumerate(numbers))
 
@@ -257,7 +257,7 @@ def _tum(
     path: Path, table: _Table, rows: list[list[Decimal]], places: tuple[str, ...], notes: tuple[str, ...]
 ) -> RawPoses:
     numbers = np.array([row[1:] for row in rows], float)
-    # "qx qy qz qw", or EuRoC's "q_RS_w [], q_RS_x [], ...", anywhere above.
+    # "qx qy qz qw", or EuRoC's "q_RS_w [], q_RS_x [], ...", anywhere in the header.
     order = "".join(re.findall(r"\bq\w*?([wxyz])\b", "\n".join(table.header).lower()))
     said: Quaternion | None = next((one for one in get_args(Quaternion) if one == order), None)
     pointed = any("." in row[len(row) - 8] for row in table.rows)
@@ -267,6 +267,6 @@ def _tum(
 
 
 def _unit_above(table: _Table) -> TimeUnit | None:
-    """As "[ns]" says it above the poses."""
+    """Unit from a header such as "[ns]"."""
     header = "\n".join(table.header).lower()
     return next((unit for unit, names in _UNITS.items() if re.search(rf"\[(?:{names})\]", header)), None)

@@ -1,4 +1,4 @@
-"""The unit of a trajectory's times, from their spacing, from their size, and from the time that they are beside."""
+"""Recognise the unit of a trajectory's times from their spacing, their size and the span of the events."""
 
 from decimal import Decimal
 from pathlib import Path
@@ -9,20 +9,20 @@ from ebarf_ns.errors import TrajectoryError
 from ebarf_ns.formats.raw_poses import TimeUnit
 
 US: dict[TimeUnit, Decimal] = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
-# Poses come a tenth of a millisecond to ten seconds apart, and those in milliseconds at 1 to 1000 a second.
+# Plausible spacings: 0.1 ms to 10 s, and for times in milliseconds, 1 to 1000 poses per second.
 _SPACINGS_S: dict[TimeUnit, tuple[float, float]] = {
     "s": (1e-4, 10.0), "ms": (1e-3, 1.0), "us": (1e-4, 10.0), "ns": (1e-4, 10.0)
 }  # fmt: skip
-# Of clocks that count from 1970: 2001 to 2100.
+# Unix times from 2001 to 2100.
 _DATES_S = (978e6, 4.1e9)
 _LEAST_SHARE, _CLEARLY = 0.01, 10
 
 
 def recognised_unit(path: Path, times: list[Decimal], span_us: tuple[int, int] | None = None) -> TimeUnit:
-    """The unit in which the spacing of the poses is plausible; ``span_us`` is that of the events or a reference.
+    """The unit for which the spacing of the poses is plausible; ``span_us`` is that of the events or a reference.
 
-    Raises :class:`TrajectoryError` where several are. Seconds or microseconds are taken before milliseconds only where
-    they go with ``span_us`` and milliseconds do not.
+    Raises :class:`TrajectoryError` if several units are. Seconds or microseconds are preferred to milliseconds only if
+    they match ``span_us`` and milliseconds do not.
     """
     steps = [abs(float(after - before)) for before, after in zip(times, times[1:], strict=False)]
     spacing = float(np.median(steps)) if steps else 0.0
@@ -49,7 +49,7 @@ def recognised_unit(path: Path, times: list[Decimal], span_us: tuple[int, int] |
 
 
 def _beside(times: list[Decimal], fitting: list[TimeUnit], span_us: tuple[int, int] | None) -> str:
-    """How many poses of each reading are where the events are, for the one who is asked."""
+    """Hint for the user: the number of poses within the span of the events for each unit."""
     if not fitting:
         return ""
     said = ', or a unit as "[s]" in a line of names'
@@ -61,7 +61,7 @@ def _beside(times: list[Decimal], fitting: list[TimeUnit], span_us: tuple[int, i
 
 
 def _shared(times: list[Decimal], unit: TimeUnit, span_us: tuple[int, int]) -> float:
-    """The time that both spans have in common, as a share of all that either covers."""
+    """Intersection over union of both spans."""
     first, last = float(min(times) * US[unit]), float(max(times) * US[unit])
     common = min(last, span_us[1]) - max(first, span_us[0])
     return max(common, 0.0) / max(max(last, span_us[1]) - min(first, span_us[0]), 1.0)

@@ -1,1 +1,1 @@
-"""From time to pose: trajectories, rotations, cameras, clocks."""
+"""Trajectories, rotations, camera models and clock offsets."""

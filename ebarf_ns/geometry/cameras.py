@@ -1,4 +1,4 @@
-"""From pixel to bearing: the camera models of the datasets and their inverse."""
+"""The camera models of the datasets: projection and unprojection to bearing vectors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CameraModel = Literal["pinhole", "radtan", "equidistant"]
 Crop = tuple[int, int, int, int]
-"""First column and row, and those after the last."""
+"""(left, top, right, bottom) in pixels; right and bottom are exclusive."""
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 
 
@@ -43,7 +43,7 @@ class Camera:
         return torch.stack([x, y], dim=-1).double()
 
     def bearings(self, pixel: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-        """Unit viewing directions of pixels, in the camera's OpenCV frame, float64."""
+        """Unit viewing directions of pixels in the camera's OpenCV frame, float64."""
         distorted = (pixel.double() - self._centre) / self._focal
         if self.model == "equidistant":
             return _equidistant_bearings(distorted, self.distortion)
@@ -71,13 +71,13 @@ class Camera:
 
 
 def cropped(camera: Camera, crop: Crop) -> Camera:
-    """The camera that has those pixels alone."""
+    """The camera of the cropped image."""
     left, top, right, bottom = crop
     return replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
 
 
 def distort_radtan(plane: Float[Tensor, "*batch 2"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch 2"]:
-    """Brown's model: (k1, k2, p1, p2[, k3]), numbers or tensors, of points at distance 1."""
+    """Apply Brown's model with (k1, k2, p1, p2[, k3]), numbers or tensors, to normalised image coordinates."""
     k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
     x, y = plane.unbind(-1)
     r2 = x * x + y * y
@@ -92,7 +92,7 @@ def distort_radtan(plane: Float[Tensor, "*batch 2"], coefficients: Sequence[Any]
 
 
 def _undistort_radtan(distorted: Tensor, coefficients: tuple[float, ...], iterations: int = 20) -> Tensor:
-    """Newton's method on the distortion; its Jacobian is 2x2 and comes from autograd's vector products."""
+    """Invert the distortion by Newton's method; the 2x2 Jacobian comes from autograd."""
     plane = distorted.clone()
     for _ in range(iterations):
         with torch.enable_grad():
@@ -104,7 +104,7 @@ def _undistort_radtan(distorted: Tensor, coefficients: tuple[float, ...], iterat
 
 
 def equidistant_radius(angle_rad: Float[Tensor, "*batch"], coefficients: Sequence[Any]) -> Float[Tensor, "*batch"]:
-    """Kannala and Brandt's distance from the centre, for (k1, k2, k3, k4), numbers or tensors."""
+    """Kannala and Brandt's image radius for (k1, k2, k3, k4), numbers or tensors."""
     k1, k2, k3, k4 = coefficients
     a2 = angle_rad * angle_rad
     return angle_rad * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))

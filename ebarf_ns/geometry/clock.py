@@ -1,4 +1,4 @@
-"""By how much the clock of a trajectory is off, told by how the trajectory was corrected."""
+"""Clock offset of a trajectory, estimated from its corrections or from the event rate."""
 
 from __future__ import annotations
 
@@ -30,38 +30,38 @@ _BIN_US, _SMOOTH_BINS = 5_000, 3.0
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """What is to be added to a trajectory's times so that it fits the events."""
+    """Offset to add to a trajectory's times so that it fits the events."""
 
     offset_us: int
     deviation_us: float
     """Standard deviation of ``offset_us``."""
     moved_rad: float
-    """Root mean square of the corrections that it explains."""
+    """RMS of the corrections that the offset explains."""
     by_chance: float
-    """How likely chance explains as much of the corrections as the offset does."""
+    """p-value: probability that chance explains as much of the corrections as the offset does."""
 
     @property
     def certain(self) -> bool:
-        """Whether there is an offset at all."""
+        """Whether the offset is significant."""
         return self.by_chance < _CERTAIN
 
     @property
     def likely(self) -> bool:
-        """Whether it is worth asking something else."""
+        """Whether the offset is plausible enough for a second test."""
         return self.by_chance < _LIKELY
 
 
 def clock_offset(
     given: Trajectory, found: Trajectory, translation: float = 1.0, kind: Interpolation = "linear"
 ) -> ClockOffset:
-    """The offset by which ``given``, moved along its own path, comes closest to ``found``.
+    """The time offset that brings ``given`` closest to ``found``.
 
-    Corrections of a late clock are the velocity times the offset; any others are no multiple of it. Rotations in
-    radians and positions times ``translation`` count alike, less a similarity of the world, which no event tells. What
-    is left over is correlated from keyframe to keyframe, and so has fewer degrees of freedom than numbers.
-    Offsets of up to a quarter of the trajectory's span are looked for.
+    Corrections due to a clock offset are the velocity times the offset; other corrections are not proportional to
+    velocity. The distance adds rotations in radians and positions times ``translation``, after removing a similarity of
+    the world, which events do not constrain. Residuals are correlated between keyframes, so they have fewer degrees of
+    freedom than values. The search covers offsets up to a quarter of the trajectory's span.
     """
-    # The best of several least squares solvers is there on the CPU alone.
+    # The robust least-squares driver exists only on the CPU.
     given, found = (
         Trajectory(one.t_us.cpu(), Poses(*(column.cpu() for column in one.poses))) for one in (given, found)
     )
@@ -71,14 +71,14 @@ def clock_offset(
     centre, step = 0.0, 2 * most_us / (_CANDIDATES - 1)
     for _ in range(_ROUNDS):
         candidates = [centre + step * (k - _CANDIDATES // 2) for k in range(_CANDIDATES)]
-        left = [_distance(given, found, round(offset), translation, kind)[0] for offset in candidates]
-        centre, step = candidates[min(range(len(left)), key=left.__getitem__)], 4 * step / _CANDIDATES
+        costs = [_distance(given, found, round(offset), translation, kind)[0] for offset in candidates]
+        centre, step = candidates[min(range(len(costs)), key=costs.__getitem__)], 4 * step / _CANDIDATES
     offset_us = round(centre)
     before, _ = _distance(given, found, 0, translation, kind)
     after, numbers = _distance(given, found, offset_us, translation, kind)
     freedom = max(numbers - 1, 1.0)
     f_ratio = max(before / max(after, 1e-18) - 1, 0.0) * freedom
-    # How fast the distance grows to either side.
+    # Curvature of the cost around the minimum.
     sides = (_distance(given, found, offset_us + side, translation, kind)[0] for side in (-_SIDE_US, _SIDE_US))
     growth = (sum(sides) / 2 - after) / _SIDE_US**2
     deviation_us = (after / (growth * freedom)) ** 0.5 if growth > 0 else inf
@@ -92,11 +92,11 @@ def offset_by_activity(
     bearings: Float[Tensor, "pixels 3"],
     kind: Interpolation = "linear",
 ) -> tuple[int, float, float]:
-    """The offset at which the rate of events goes best with the speed of the image, and the correlation of their
-    logarithms there and without an offset.
+    """The offset at which the event rate correlates best with image speed, and the correlation of their logarithms at
+    that offset and at zero.
 
-    Good to some hundredths of a second: the rate goes by what is in view, too. Events are those within the span of
-    ``given``; the image moves as at unit distance, in the viewing directions ``bearings`` of the camera.
+    Accurate to some hundredths of a second, since the rate also depends on the scene. Events must lie in the span of
+    ``given``; image motion is computed at unit distance along the camera's viewing directions ``bearings``.
     """
     first_us, last_us = (int(t_us) for t_us in given.t_us[[0, -1]])
     bins = max((last_us - first_us) // _BIN_US, 1)
@@ -106,17 +106,17 @@ def offset_by_activity(
     poses = interpolate(given.t_us, given.poses, edges_us, kind)
     turn = turn_between(poses.quat_wxyz[:-1], poses.quat_wxyz[1:])[:, None].double()
     shift = rotate(quat_wxyz_conjugate(poses.quat_wxyz[:-1]), poses.position.diff(dim=0))[:, None].double()
-    towards = bearings[None].to(turn)
-    across = shift - (shift * towards).sum(dim=-1, keepdim=True) * towards
-    moved = (torch.linalg.cross(turn, towards) + across).square().sum(dim=-1).mean(dim=-1).sqrt()
+    bearing = bearings[None].to(turn)
+    across = shift - (shift * bearing).sum(dim=-1, keepdim=True) * bearing
+    moved = (torch.linalg.cross(turn, bearing) + across).square().sum(dim=-1).mean(dim=-1).sqrt()
     speed = gaussian_filter1d(moved.cpu().numpy(), _SMOOTH_BINS)
     motion = np.log(speed + 1e-3 * speed.max() + 1e-12)
     most = int(_MOST_SHARE * bins)
     found = []
     for lag in range(-most, most + 1):
         seen, expected = rate[max(lag, 0) : bins + min(lag, 0)], motion[max(-lag, 0) : bins - max(lag, 0)]
-        alike = float(np.corrcoef(seen, expected)[0, 1]) if seen.std() > 0 and expected.std() > 0 else 0.0
-        found.append((alike, lag * _BIN_US))
+        correlation = float(np.corrcoef(seen, expected)[0, 1]) if seen.std() > 0 and expected.std() > 0 else 0.0
+        found.append((correlation, lag * _BIN_US))
     best, offset_us = max(found)
     return offset_us, best, found[most][0]
 
@@ -124,23 +124,23 @@ def offset_by_activity(
 def _distance(
     given: Trajectory, found: Trajectory, offset_us: int, translation: float, kind: Interpolation
 ) -> tuple[float, float]:
-    """Mean square of what is left between the two, and how many independent numbers that is made of."""
+    """Mean square of the residuals, and their number of degrees of freedom."""
     inside = within_span(found.t_us - offset_us, given.t_us)
     if int(inside.sum()) < _FEWEST:
         return inf, 0.0
     poses = interpolate(given.t_us, given.poses, found.t_us[inside] - offset_us, kind)
-    left = differences_less_similarity(poses, Poses(*(column[inside] for column in found.poses)), translation)
-    power = float(left.square().sum())
-    rough = float(left.diff(dim=0).square().sum()) / max(2 * power, 1e-30)
-    share = left.square().sum(dim=0) / max(power, 1e-30)
+    residual = differences_less_similarity(poses, Poses(*(column[inside] for column in found.poses)), translation)
+    power = float(residual.square().sum())
+    rough = float(residual.diff(dim=0).square().sum()) / max(2 * power, 1e-30)
+    share = residual.square().sum(dim=0) / max(power, 1e-30)
     channels = 1 / max(float(share.square().sum()), 1e-30)
-    # Of noise smoothed by a Gaussian, sqrt(rough / pi) of the numbers are independent.
-    return power / len(left), channels * (len(left) * min((rough / pi) ** 0.5, 1.0) - 1)
+    # Noise smoothed by a Gaussian has a share sqrt(rough / pi) of independent values.
+    return power / len(residual), channels * (len(residual) * min((rough / pi) ** 0.5, 1.0) - 1)
 
 
 def differences_less_similarity(some: Poses, others: Poses, translation: float = 1.0) -> Float[Tensor, "poses 6"]:
-    """Rotation vectors from ``some`` to ``others`` in the world, and shifts times ``translation``, less what the best
-    small similarity of the whole world does. Of uniform motion, a late clock is nothing but that."""
+    """Rotation vectors from ``some`` to ``others`` in the world frame and shifts times ``translation``, after removing
+    the best small similarity of the whole world. For uniform motion, a clock offset is such a similarity."""
     some, others = (Poses(*(column.double().cpu() for column in poses)) for poses in (some, others))
     centre = some.position.mean(dim=0)
     weight = torch.tensor([1.0] * 3 + [translation] * 3, dtype=torch.float64, device=centre.device)
@@ -151,10 +151,10 @@ def differences_less_similarity(some: Poses, others: Poses, translation: float =
         rows = torch.cat([torch.cat([axes, about], 2), torch.cat([torch.zeros_like(axes), axes], 2)], dim=1)
         larger = torch.cat([torch.zeros_like(position), position], dim=1)[:, None]
         columns = (weight[:, None] * torch.cat([rows, larger], dim=1).mT).flatten(0, 1)
-        left = weight * _displacement(some, others)
-        # A camera that stays in one place knows no scale.
+        residual = weight * _displacement(some, others)
+        # A static camera leaves the scale undetermined: gelsd handles rank deficiency.
         turn, shift, growth = (
-            torch.linalg.lstsq(columns, left.flatten()[:, None], driver="gelsd").solution[:, 0].split([3, 3, 1])
+            torch.linalg.lstsq(columns, residual.flatten()[:, None], driver="gelsd").solution[:, 0].split([3, 3, 1])
         )
         turned = quat_wxyz_exp(turn).expand_as(some.quat_wxyz)
         some = Poses(
@@ -164,6 +164,6 @@ def differences_less_similarity(some: Poses, others: Poses, translation: float =
 
 
 def _displacement(some: Poses, others: Poses) -> Float[Tensor, "poses 6"]:
-    """Rotation vectors and shifts from some poses to others, in the world."""
+    """Rotation vectors and shifts between poses, in the world frame."""
     turn = rotate(some.quat_wxyz, turn_between(some.quat_wxyz, others.quat_wxyz))
     return torch.cat([turn, others.position - some.position], dim=-1)

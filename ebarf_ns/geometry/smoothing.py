@@ -1,4 +1,4 @@
-"""Take out of a trajectory what no hand could have done."""
+"""Smooth noisy keyframe poses by a smoothing spline."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _ROBUSTNESS = 0.5
 
 
 def smoothed(trajectory: Trajectory) -> Trajectory:
-    """The keyframes moved onto a smoothing spline, one for positions and one for rotations, whose stiffness generalised
-    cross-validation chooses.
+    """The keyframes moved onto smoothing splines, one for positions and one for rotations, with stiffness chosen by
+    generalised cross-validation.
 
-    Independent errors of the keyframes shrink by the number of keyframes per movement; keyframes that already lie on
-    a smooth path are left where they are, since cross-validation then chooses no smoothing (Craven & Wahba 1978).
+    Independent keyframe errors shrink with the number of keyframes per movement; keyframes on a smooth path stay in
+    place, since cross-validation then chooses no smoothing (Craven & Wahba 1978).
     """
     if len(trajectory.t_us) < _FEWEST:
         return trajectory
     t = (trajectory.t_us - trajectory.t_us[0]).numpy() / float(trajectory.t_us.diff().double().mean())
     quat_wxyz = trajectory.poses.quat_wxyz.double().numpy()
-    # Neighbours on the same side of the double cover, so that components run smoothly.
+    # Keep neighbours in the same hemisphere of the double cover, so that components are continuous.
     flips = np.sign((quat_wxyz[1:] * quat_wxyz[:-1]).sum(axis=1))
     quat_wxyz = quat_wxyz * np.r_[1, np.cumprod(np.where(flips == 0, 1, flips))][:, None]
     position = _smooth(t, trajectory.poses.position.double().numpy())
@@ -41,25 +41,25 @@ def smoothed(trajectory: Trajectory) -> Trajectory:
 
 def _smooth(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "keyframes dim"]) -> np.ndarray:
     spread = np.ptp(columns, axis=0).max()
-    # Cross-validation divides by what is left to explain, which must not be rounding error.
+    # Cross-validation divides by the residual, which must not be rounding error.
     if spread <= 1e-9 * max(1.0, float(np.abs(columns).max())):
         return columns
     unit = (columns - columns[0]) / spread
-    # Of very many, every so-manieth tells; the best stiffness grows with the fifth root of their number.
+    # Long trajectories are subsampled; the best stiffness grows with the fifth root of the number of keyframes.
     every = -(-len(t) // _MOST)
     stiffness = _stiffness(t[::every], unit[::every]) * every**0.2
-    # Column by column: before SciPy 1.16 it takes one at a time.
+    # Before SciPy 1.16, only one column at a time is supported.
     smooth = [make_smoothing_spline(t, column, lam=stiffness)(t) for column in unit.T]
     return np.stack(smooth, axis=1) * spread + columns[0]
 
 
 def _stiffness(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "keyframes dim"]) -> float:
-    """The weight of bending against distance that minimises the robust score of generalised cross-validation.
+    """The smoothing parameter that minimises the robust score of generalised cross-validation.
 
     With the bending energy f' K f, K = Q R⁻¹ Q' (Green & Silverman 1994, 2.1), a fit is A y, A = (1 + weight K)⁻¹; in
-    the eigenvectors of K every weight is tried at once. Columns err alike, and choose together. Among few keyframes
-    the plain score now and then follows the noise; here it is multiplied by how much of that a fit takes on, between a
-    half and one for tr(A²) between 0 and all (Lukas 2006).
+    the eigenbasis of K all weights are evaluated at once. Columns have equal noise and share one weight. With few
+    keyframes the plain score sometimes overfits; it is therefore multiplied by a factor from 1/2 to 1 that grows with
+    tr(A²) (Lukas 2006).
     """
     gap = np.diff(t)
     inner = np.arange(len(t) - 2)
@@ -72,5 +72,5 @@ def _stiffness(t: Float[np.ndarray, "keyframes"], columns: Float[np.ndarray, "ke
     left_out = weights[:, None] * bending.clip(0) / (1 + weights[:, None] * bending.clip(0))
     power = np.square(direction.T @ columns).sum(axis=1)
     score = (left_out**2 * power).sum(axis=1) / left_out.sum(axis=1) ** 2
-    taken_on = _ROBUSTNESS + (1 - _ROBUSTNESS) * np.square(1 - left_out).mean(axis=1)
-    return float(weights[(score * taken_on).argmin()])
+    robust_factor = _ROBUSTNESS + (1 - _ROBUSTNESS) * np.square(1 - left_out).mean(axis=1)
+    return float(weights[(score * robust_factor).argmin()])

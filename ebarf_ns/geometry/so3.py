@@ -1,8 +1,7 @@
-"""Rotations as unit quaternions (w, x, y, z): exponential, product, interpolation, all finite with finite gradients.
+"""Rotations as unit quaternions (w, x, y, z): exponential, logarithm and product, all with finite gradients.
 
-No function calls acos or divides by an angle that may be 0: small angles go through Taylor series selected by the
-double-where idiom (the unused branch sees a harmless argument, so that its gradient is never NaN), larger ones through
-atan2.
+No function calls acos or divides by an angle that may be 0: small angles use Taylor series, selected by the
+double-where idiom (the unused branch gets a safe argument, so that its gradient is never NaN), larger ones atan2.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Below this squared half-angle the series to second order are exact to float32 and float64 rounding respectively.
+# Below this squared half-angle, the second-order series are exact to float32 and float64 rounding respectively.
 _SERIES_BELOW = {torch.float32: 1e-4, torch.float64: 1e-6}
 
 
@@ -33,7 +32,7 @@ def _sinc(angle_squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def quat_wxyz_exp(rotation_vector_rad: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """The unit quaternion that rotates by ``|v|`` about ``v``; the identity, with gradient I/2, at 0."""
+    """The unit quaternion that rotates by ``|v|`` about ``v``; at 0 the identity, with gradient I/2."""
     half = rotation_vector_rad / 2
     angle_squared = (half * half).sum(-1, keepdim=True)
     sinc, sinc_of_half = _sinc(torch.cat([angle_squared, angle_squared / 4], dim=-1)).split(1, dim=-1)
@@ -42,7 +41,7 @@ def quat_wxyz_exp(rotation_vector_rad: Float[Tensor, "*batch 3"]) -> Float[Tenso
 
 
 def quat_wxyz_log(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
-    """The rotation vector, at most pi long, of a unit quaternion; q and -q give the same one."""
+    """The rotation vector of a unit quaternion, of length at most pi; q and -q give the same one."""
     quat_wxyz = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)
     w, vector = quat_wxyz[..., :1], quat_wxyz[..., 1:]
     sine_squared = (vector * vector).sum(-1, keepdim=True)
@@ -50,7 +49,7 @@ def quat_wxyz_log(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
     sine = torch.where(small, torch.ones_like(sine_squared), sine_squared).sqrt()
     cosine = torch.where(small, w, torch.ones_like(w))
     tangent_squared = sine_squared / cosine**2
-    # atan(x)/x = 1 - x^2/3 + x^4/5 - ...; dividing by w makes it exact for quaternions a rounding off unit length.
+    # atan(x)/x = 1 - x^2/3 + x^4/5 - ...; dividing by w cancels rounding errors of the quaternion's length.
     series = 2 / cosine * (1 - tangent_squared * (1 / 3 - tangent_squared / 5))
     return vector * torch.where(small, series, 2 * torch.atan2(sine, w) / sine)
 
@@ -66,7 +65,7 @@ def quat_wxyz_conjugate(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "
 
 
 def turn_between(start: Float[Tensor, "*batch 4"], end: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
-    """The rotation vector, in the start's frame, that turns one rotation into another; both are unit quaternions."""
+    """The rotation vector, in the start frame, from one rotation to another; both are unit quaternions."""
     return quat_wxyz_log(quat_wxyz_multiply(quat_wxyz_conjugate(start), end))
 
 
@@ -76,14 +75,14 @@ def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "
     return identity + _sums_of_products(quat_wxyz, quat_wxyz, _ROTATION).unflatten(-1, (3, 3))
 
 
-# Which products of components (w x y z of each) make up each component of the Hamilton product a b ...
+# Products of components (w x y z of each) that sum to each component of the Hamilton product a b ...
 _HAMILTON = (
     "ww -xx -yy -zz",
     "wx xw yz -zy",
     "wy -xz yw zx",
     "wz xy -yx zw",
 )
-# ... and each entry of the rotation matrix less the identity, twice over.
+# ... and, each twice, to each entry of the rotation matrix minus the identity.
 _ROTATION = (
     "-yy -yy -zz -zz", "xy xy -wz -wz", "xz xz wy wy",
     "xy xy wz wz", "-xx -xx -zz -zz", "yz yz -wx -wx",
@@ -92,9 +91,9 @@ _ROTATION = (
 
 
 def _sums_of_products(a: Tensor, b: Tensor, sums: tuple[str, ...]) -> Tensor:
-    """One product with a constant matrix, where written-out sums would take dozens of operations a batch."""
+    """One product with a constant matrix; explicit sums would take dozens of kernel launches."""
     products = (a[..., :, None] * b[..., None, :]).flatten(-2)
-    # A product of matrices is what mixed precision rounds; poses are not to be rounded.
+    # Autocast would run this matrix product in low precision, which poses cannot afford.
     with torch.autocast(a.device.type, enabled=False):
         return products @ _matrix_of(sums, products.dtype, a.device)
 

@@ -1,7 +1,7 @@
-"""Timestamped keyframe poses, their corrections, and the pose of any moment between them.
+"""Timestamped keyframe poses, their corrections, and interpolation between them.
 
-Poses are camera-to-world, OpenCV axes (x right, y down, z forward). Times are int64 microseconds up to the one
-subtraction that makes them a fraction of a keyframe interval.
+Poses are camera-to-world, OpenCV axes (x right, y down, z forward). Times stay int64 microseconds until they are
+subtracted to give the fraction of a keyframe interval.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Trajectory(NamedTuple):
 
 
 def check_keyframes(t_us: Int64[Tensor, "keyframes"]) -> None:
-    """Raise :class:`TrajectoryError` unless there are two keyframes or more, in strictly increasing time."""
+    """Raise :class:`TrajectoryError` unless there are at least two keyframes with strictly increasing times."""
     if len(t_us) < 2:
         raise TrajectoryError(f"a trajectory needs at least 2 keyframes, got {len(t_us)}")
     late = torch.nonzero(t_us[1:] <= t_us[:-1])
@@ -61,7 +61,8 @@ def check_keyframes(t_us: Int64[Tensor, "keyframes"]) -> None:
 def densified(
     trajectory: Trajectory, longest_gap_us: int, kind: Interpolation
 ) -> tuple[Trajectory, Int64[Tensor, "given"]]:
-    """The trajectory with poses inserted, evenly, wherever two are further apart than that; and where those given are.
+    """Insert evenly spaced poses wherever two are further apart than ``longest_gap_us``; also returns the indices of
+    the given poses.
 
     0 inserts none.
     """
@@ -84,16 +85,16 @@ def corrected(keyframes: Poses, correction: Float[Tensor, "keyframes 6"]) -> Pos
 
 
 def within_span(t_us: Int64[Tensor, "*batch"], keyframe_t_us: Int64[Tensor, "keyframes"]) -> Bool[Tensor, "*batch"]:
-    """Whether each time lies between the first and the last keyframe, both included."""
+    """Whether each time lies between the first and the last keyframe, inclusive."""
     return (t_us >= keyframe_t_us[0]) & (t_us <= keyframe_t_us[-1])
 
 
 def intervals(
     keyframe_t_us: Int64[Tensor, "keyframes"], t_us: Int64[Tensor, "*batch"]
 ) -> tuple[Int64[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Between which keyframes each time lies: the left one's number, and the fraction of the way to the next, float64.
+    """Index of the keyframe before each time, and the fraction of the way to the next one, float64.
 
-    Times outside the span count as the nearer end.
+    Times outside the span are clamped to it.
     """
     t_us = t_us.clamp(keyframe_t_us[0], keyframe_t_us[-1])
     left = (torch.searchsorted(keyframe_t_us, t_us, right=True) - 1).clamp(0, len(keyframe_t_us) - 2)
@@ -108,12 +109,12 @@ def interpolate(
     kind: Interpolation = "linear",
     delay_us: Float[Tensor, "*batch"] | None = None,
 ) -> Poses:
-    """The poses at ``t_us``: SLERP of the rotations and LERP of the positions (Eq. 3), or both with velocities that
-    run on through the keyframes, as cubic splines have them.
+    """The poses at ``t_us``: SLERP of the rotations and LERP of the positions (Eq. 3), or cubic splines of both, with
+    velocities continuous across keyframes.
 
-    SLERP from a to b is a · exp(u · log(a⁻¹ b)): regular where a = ±b; at exactly half a turn one of two arcs is taken.
-    Times outside the span of the keyframes get the pose of the nearer end; callers drop them by :func:`within_span`.
-    With ``delay_us``, poses are those so much earlier, and have a gradient to it.
+    SLERP from a to b is a · exp(u · log(a⁻¹ b)): regular at a = ±b; at exactly half a turn, one of two arcs is taken.
+    Times outside the span of the keyframes get the nearer end pose; callers drop them with :func:`within_span`.
+    With ``delay_us``, the poses are those that much earlier, differentiable in the delay.
     """
     if delay_us is not None:
         whole_us = delay_us.detach().round()
@@ -126,7 +127,7 @@ def interpolate(
     turn = turn_between(quat_wxyz[:-1], quat_wxyz[1:])
     change = torch.cat([turn, position[1:] - position[:-1]], dim=-1)
     bends = _bends(keyframe_t_us, change) if kind == "cubic" else ()
-    # Looked up together: every table that is looked up costs a pass over the gradients of all times.
+    # One lookup for all columns: each lookup costs a pass over the gradients of all times.
     columns = torch.cat([position[:-1], quat_wxyz[:-1], change, *bends], dim=-1)
     start, frame, change, *bends = columns[left].split([3, 4, 6, *(6 for _ in bends)], dim=-1)
     moved = u * change
@@ -138,12 +139,13 @@ def interpolate(
 def _bends(
     keyframe_t_us: Int64[Tensor, "keyframes"], change: Float[Tensor, "intervals 6"]
 ) -> tuple[Float[Tensor, "intervals 6"], Float[Tensor, "intervals 6"]]:
-    """Second derivatives at either end of each interval, over 6 and per interval squared, that make splines of lines.
+    """Second derivatives at the ends of each interval, divided by 6 and scaled by the squared interval, that turn the
+    linear interpolation into splines.
 
-    The rotations' spline is that of the body's angular velocity. It takes the frames of neighbouring keyframes for
-    the same, which matters as little as the second derivative turns from one to the next. In the first and the last
-    interval the second derivative is constant: zero at the ends, as of a natural spline, it would bend a motion that
-    is under way when the recording begins, and the end keyframes with it.
+    The rotation spline uses the body's angular velocity. It treats the frames of neighbouring keyframes as equal; the
+    error is small, since the second derivative rotates little between keyframes. The second derivative is constant in
+    the first and last interval: a natural spline, with zero at the ends, would distort a motion that is under way when
+    the recording begins, and the end keyframes with it.
     """
     if len(change) < 2:
         return torch.zeros_like(change), torch.zeros_like(change)
@@ -156,7 +158,7 @@ def _bends(
 
 
 class _SolveTridiagonal(torch.autograd.Function):
-    """x of A x = b for the symmetric tridiagonal A of the spline; linear in the number of keyframes."""
+    """Solves A x = b for the spline's symmetric tridiagonal A, in time linear in the number of keyframes."""
 
     @staticmethod
     def forward(ctx, interval_s: Tensor, right: Tensor) -> Tensor:
@@ -169,17 +171,17 @@ class _SolveTridiagonal(torch.autograd.Function):
 
 
 def _solve_spline_system(interval_s: Tensor, right: Tensor) -> Tensor:
-    """Second derivatives at all keyframes but the first and the last, which have those of their neighbours."""
+    """Second derivatives at all inner keyframes; the first and the last take those of their neighbours."""
     from scipy.linalg import solveh_banded
 
     interval = interval_s[:, 0].cpu().numpy()
-    # The rows of those two stand for themselves.
+    # The rows of these two are identities.
     upper_bands = np.zeros((2, len(interval) + 1))
     upper_bands[0, 2:-1] = interval[1:-1]
     upper_bands[1] = 1.0
     upper_bands[1, 1:-1] = 2 * (interval[1:] + interval[:-1])
     upper_bands[1, 1] += interval[0]
     upper_bands[1, -2] += interval[-1]
-    # A gradient that is not finite goes on its way to where such steps are skipped.
+    # Non-finite gradients pass through; the trainer skips such steps.
     solution = solveh_banded(upper_bands, right.detach().cpu().numpy(), check_finite=False)
     return torch.from_numpy(solution).to(right)

@@ -1,4 +1,4 @@
-"""Trajectories on disk: TUM text, ``timestamp[s] tx ty tz qx qy qz qw``, one pose a line, ``#`` starts a comment."""
+"""Trajectories on disk: TUM text, ``timestamp[s] tx ty tz qx qy qz qw``, one pose per line; ``#`` starts a comment."""
 
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
@@ -12,7 +12,7 @@ from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes
 
 _COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _DIGITS = 30
-# Quaternions are written with 6 digits or more; further off unit length is a different mistake than rounding.
+# Quaternions are written with 6 digits or more; a larger deviation from unit length is not rounding.
 _QUATERNION_TOLERANCE = 1e-3
 
 
@@ -71,7 +71,7 @@ def _parse_pose(place: str, fields: list[str]) -> tuple[int, list[float]]:
 
 
 def write_tum(path: Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
-    """Write poses as TUM text, times to the microsecond, below one line for each comment."""
+    """Write poses as TUM text with times to the microsecond, preceded by one line per comment."""
     lines = [f"# {comment}" for comment in (*comments, "timestamp[s] tx ty tz qx qy qz qw")]
     position, quat_wxyz = trajectory.poses.position.double(), trajectory.poses.quat_wxyz.double()
     for t_us, p, (w, *xyz) in zip(trajectory.t_us.tolist(), position.tolist(), quat_wxyz.tolist(), strict=True):

@@ -1,7 +1,7 @@
-"""Before training: large errors of the trajectory and of its clock, found by a field too coarse to lock them in.
+"""Alignment before training: a coarse field finds large errors of the trajectory and its clock.
 
-What was found is measured as motion of the image. Where that is little, the trajectory was good, and is left alone:
-the coarse field's own errors, a pixel along directions that events hardly tell, would be all that it gets.
+The correction is measured as image motion. If it is small, the trajectory is kept as given: it would only pick up the
+coarse field's own errors, about a pixel in directions that events barely constrain.
 """
 
 from __future__ import annotations
@@ -28,54 +28,51 @@ if TYPE_CHECKING:
     from ebarf_ns.nerf.model import EbarfModel
     from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer
 
-# Both runs that drifted by 12 pixels (5 degrees) came back with these.
+# Both runs that drifted by 12 pixels (5 degrees) recovered with these.
 _FIRST_RATE, _LAST_RATE, _POWER = 0.4, 0.05, 0.25
-# Odometry errs by degrees rather than by pixels of translation. What moves the image alike is told apart by this, and
-# by what leaving the trajectory costs a squared pixel: without them, rotation and shift grow together, in opposition.
+# Odometry errors are degrees of rotation rather than pixels of translation. This prior scale, and the cost per squared
+# pixel of leaving the trajectory, separate the two: without them, opposite rotations and shifts grow together.
 _TRANSLATION_PX, _COST = 0.3, 1e-4
-# The same in training, where errors were smooth. Noise on every keyframe is more than that would let go: -0.5 dB.
+# The same in training, for smooth errors only. It would hold back corrections of noise on every keyframe: -0.5 dB.
 _COST_IN_TRAINING, _SMOOTH = 3e-4, 0.06
 _PROBE, _CERTAINLY_GOOD_PX, _GOOD_PX = 200, 1.0, 1.8
 _BATCHES_TO_MEASURE = 2
-# A field adapts to the intrinsics that it grows up with: a second one brings 0.7 % of the focal length to 0.2 %.
+# A field adapts to its initial intrinsics: a second pass reduces the focal length error from 0.7 % to 0.2 %.
 _INTRINSICS_FROM, _INTRINSICS_PASSES = 0.2, 2
 _WARM_UP = 5
 _CLOCK_EVERY, _LEAST_CLOCK_PX = 100, 0.2
-# What the rate of events says of the clock is looked into when it says a lot.
-_LEAST_ACTIVITY_US, _LEAST_ALIKE, _LEAST_GAIN = 40_000, 0.5, 0.05
+# A clock offset from the event rate is only tested if it is large and its correlation clear.
+_LEAST_ACTIVITY_US, _LEAST_CORRELATION, _LEAST_GAIN = 40_000, 0.5, 0.05
 _SOME_BEARINGS, _SOME_EVENTS = 50, 5_000_000
 _CLOCK_STEPS, _CLOCK_DEVIATIONS = 100, 3.0
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What the coarse field found."""
+    """Result of the alignment."""
 
     moved_px: float
-    """Root mean square motion of the image at events, less what moves the whole scene along."""
+    """RMS image motion at events, after removing motion of the whole scene."""
     taken: bool
-    """Whether training begins from the keyframes found."""
+    """Whether training starts from the aligned keyframes."""
     clock_offset_us: int
-    """What was added to the trajectory's times; 0: they fit the events."""
+    """Offset added to the trajectory's times; 0: they fit the events."""
     steps: int
     seconds: float
 
     def __str__(self) -> str:
-        clock = (
-            f"clock off by {self.clock_offset_us / 1000:+.1f} ms, which is made good; " if self.clock_offset_us else ""
-        )
+        clock = f"clock off by {self.clock_offset_us / 1000:+.1f} ms, now corrected; " if self.clock_offset_us else ""
         if self.taken:
-            return f"trajectory: {clock}off by {self.moved_px:.1f} px, training begins where a coarse field puts it"
-        return f"trajectory: {clock}good to {self.moved_px:.1f} px, training begins from it as it is"
+            return f"trajectory: {clock}off by {self.moved_px:.1f} px, training starts from the coarse alignment"
+        return f"trajectory: {clock}good to {self.moved_px:.1f} px, training starts from it unchanged"
 
 
 def align(
     model: EbarfModel, datamanager: EventDataManager, steps: int, seed: int, most_seconds: float | None = None
 ) -> Alignment | None:
-    """Move the keyframes that ``model`` begins from to where a coarse field puts them, if that is far.
+    """Align the initial keyframes of ``model`` with a coarse field, if they move far; also corrects a clock offset.
 
-    Their clock is set by the way, where it was off. None, and nothing moved, if that would take more than
-    ``most_seconds`` or ends in numbers that are not finite.
+    Returns None and leaves everything unchanged if alignment would take more than ``most_seconds`` or diverges.
     """
     started = monotonic()
     _set_clock_by_activity(model, datamanager, seed)
@@ -117,38 +114,38 @@ def align(
 
 
 def _set_clock_by_activity(model: EbarfModel, datamanager: EventDataManager, seed: int) -> None:
-    """Set the clock to where the rate of events goes best with the motion, if a field trained there is better, too."""
+    """Set the clock to the best correlation of event rate and image motion, if held-out events confirm it."""
     keyframes = model.camera_optimizer
     some = datamanager.bearings[:: max(1, len(datamanager.bearings) // _SOME_BEARINGS)]
     kind = keyframes.config.interpolation or "linear"
     events = datamanager.index.events
     event_t_us = events["t_us"][:: max(1, len(events) // _SOME_EVENTS)]
-    offset_us, alike, now = offset_by_activity(event_t_us, keyframes.start_trajectory(), some, kind)
-    says_a_lot = abs(offset_us) >= _LEAST_ACTIVITY_US and alike > _LEAST_ALIKE and alike - now > _LEAST_GAIN
-    if says_a_lot and _is_better(model, datamanager, offset_us, seed):
+    offset_us, best, now = offset_by_activity(event_t_us, keyframes.start_trajectory(), some, kind)
+    clear = abs(offset_us) >= _LEAST_ACTIVITY_US and best > _LEAST_CORRELATION and best - now > _LEAST_GAIN
+    if clear and _is_better(model, datamanager, offset_us, seed):
         keyframes.shift_clock(offset_us)
         datamanager.shift_clock(offset_us)
 
 
 def _clock_offset_us(
-    model: EbarfModel, datamanager: EventDataManager, keyframes: TrajectoryOptimizer, in_doubt: bool, seed: int
+    model: EbarfModel, datamanager: EventDataManager, keyframes: TrajectoryOptimizer, test_likely: bool, seed: int
 ) -> int:
-    """What the corrections of ``keyframes`` so far say that the clock is off by; 0: nothing.
+    """Clock offset implied by the corrections of ``keyframes`` so far; 0: none.
 
-    Other errors may look like a late clock. So a field is asked as well, before there is any offset, and ``in_doubt``
-    even where the corrections alone would not do.
+    Other errors may look like a clock offset. A first offset is therefore confirmed on held-out events;
+    ``test_likely`` also tests offsets that are likely but not certain.
     """
     offset = keyframes.remaining_clock_offset()
     if offset.moved_rad < _LEAST_CLOCK_PX * keyframes.pixel_rad:
         return 0
     if keyframes.learns_clock:
         return offset.offset_us if offset.certain else 0
-    asked = offset.certain or (in_doubt and offset.likely)
-    return offset.offset_us if asked and _is_better(model, datamanager, offset.offset_us, seed) else 0
+    worth_testing = offset.certain or (test_likely and offset.likely)
+    return offset.offset_us if worth_testing and _is_better(model, datamanager, offset.offset_us, seed) else 0
 
 
 def _set_intrinsics(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: int) -> None:
-    """Learn the intrinsics from the trajectory as it is: moving ones take on much of what a focal length does."""
+    """Learn the intrinsics with fixed keyframes: moving ones would absorb much of a focal length error."""
     coarse = coarse_model(model, "off")
     assert model.intrinsics and coarse.intrinsics
     coarse.camera_optimizer.begin_from(model.camera_optimizer.start_trajectory().poses)
@@ -163,7 +160,7 @@ def _set_intrinsics(model: EbarfModel, datamanager: EventDataManager, steps: int
 
 
 def _is_better(model: EbarfModel, datamanager: EventDataManager, offset_us: int, seed: int) -> bool:
-    """Whether a field predicts held-out events better if the clock is shifted, and poses left as they are."""
+    """Whether a coarse field with fixed poses predicts held-out events better with the clock shifted."""
     losses, start = [], model.camera_optimizer.start_trajectory()
     for shift_us in (0, offset_us):
         shifted = Trajectory(start.t_us + shift_us, start.poses)
@@ -180,7 +177,7 @@ def _nothing_moved(model: EbarfModel, datamanager: EventDataManager) -> None:
 
 
 def _begin(model: EbarfModel, coarse: EbarfModel, taken: bool) -> None:
-    """Let training begin with what the coarse field found."""
+    """Start training from the result of the coarse field."""
     ours, found = model.camera_optimizer, coarse.camera_optimizer
     trajectory, start = found.trajectory(), found.start_trajectory()
     offset_us = int(trajectory.t_us[0] - start.t_us[0]) + int(found.clock_offset_us)
@@ -196,17 +193,17 @@ def _begin(model: EbarfModel, coarse: EbarfModel, taken: bool) -> None:
 
 
 def roughness(moved: Float[Tensor, "keyframes 6"]) -> float:
-    """Mean square of the differences between neighbours over twice the variance: 1 for white noise, 0 for drift."""
+    """Mean squared difference between neighbours over twice the variance: 1 for white noise, 0 for drift."""
     spread = (moved - moved.mean(dim=0)).square().sum()
     return float(moved.diff(dim=0).square().sum() / (2 * spread).clamp_min(1e-12))
 
 
 @torch.no_grad()
 def _moved_px(model: EbarfModel, bundles: list[RayBundle]) -> float:
-    """Root mean square distance, in pixels, between where events were seen and where the surfaces that they now see lie
-    from where training began; less the best motion and scale of the whole scene, which no event tells.
+    """RMS distance, in pixels, between events and the surfaces they now see, reprojected into the initial poses, after
+    removing the best similarity of the whole scene, which events do not constrain.
 
-    By least squares over the seven numbers of a small similarity; events at infinity have no part in its shift.
+    Solved by least squares over the seven parameters of a small similarity; events at infinity do not affect its shift.
     """
     keyframes = model.camera_optimizer
     offsets, slopes = [], []
@@ -231,9 +228,9 @@ def _moved_px(model: EbarfModel, bundles: list[RayBundle]) -> float:
     if not bool(offset.isfinite().all() and slope.isfinite().all()):
         return float("nan")
     flat = slope.flatten(0, 1)
-    # Normal equations, a little damped: a camera that only turns says nothing of scale.
+    # Slightly damped normal equations: a purely rotating camera leaves the scale undetermined.
     normal = flat.T @ flat
     damping = 1e-6 * normal.diagonal().mean() * torch.eye(7).to(normal)
     similarity = torch.linalg.solve(normal + damping, -flat.T @ offset.flatten(0, 1))
-    left = (offset + slope @ similarity).square().sum(dim=(1, 2)).mean().sqrt()
-    return float(left) / keyframes.pixel_rad
+    residual = (offset + slope @ similarity).square().sum(dim=(1, 2)).mean().sqrt()
+    return float(residual) / keyframes.pixel_rad

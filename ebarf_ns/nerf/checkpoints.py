@@ -11,14 +11,16 @@ import torch
 from torch import Tensor
 
 from ebarf_ns.errors import TrainingError
-from ebarf_ns.files import synced, whole_file
+from ebarf_ns.files import is_special, synced, whole_file
 
 FORMAT = 1
 _KEPT = 2
 
 
 def write_checkpoint(state: dict[str, Any], path: Path) -> None:
-    """Write a state of tensors and plain values whole, then remove all checkpoints but the newest two.
+    """Write a state of tensors and plain values whole, then remove all checkpoints but it and the one before.
+
+    Those of later steps are of a training that was not gone on with, or damaged.
 
     ``state["pipeline"]`` gets a checksum of its own, since nerfstudio's scripts read that part alone. Raises
     :class:`TrainingError` where the disk does not take it; what was there before stays.
@@ -26,20 +28,40 @@ def write_checkpoint(state: dict[str, Any], path: Path) -> None:
     state = {**state, "format": FORMAT, "pipeline": sealed(state["pipeline"])}
     state["checksum"] = checksum(state)
     path.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
     beside = path.parent.parent / path.name
+    write_plain(state, beside)
+    beside.replace(path)
+    synced(path.parent)
+    there = sorted(path.parent.glob("step-*.ckpt"))
+    at = there.index(path)
+    for other in (*there[: max(at + 1 - _KEPT, 0)], *there[at + 1 :]):
+        other.unlink()
+
+
+def write_plain(content: dict[str, Any], path: Path) -> None:
+    """Write tensors and plain values whole; raises :class:`TrainingError` where the disk does not take them."""
     try:
-        # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
-        with whole_file(beside) as temporary:
-            torch.save(state, temporary)
-        beside.replace(path)
+        with whole_file(path) as temporary:
+            torch.save(content, temporary)
     except (OSError, RuntimeError) as error:
         # Torch wraps what the system says.
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
         raise TrainingError(f"{path}: cannot be written ({said}); expected room on the disk") from None
-    synced(path.parent)
-    for old in sorted(path.parent.glob("step-*.ckpt"))[:-_KEPT]:
-        if old != path:
-            old.unlink()
+
+
+def read_plain(path: Path, what: str) -> dict[str, Any]:
+    """What :func:`write_plain` wrote, on the processor, and nothing that would run code; raises :class:`TrainingError`
+    that says what it should be."""
+    if is_special(path):
+        raise TrainingError(f"{path}: a pipe or a device, expected a run's {what}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        return {**content}
+    except FileNotFoundError:
+        raise TrainingError(f"{path}: is no file, expected a run's {what}") from None
+    except Exception as error:  # whatever damaged bytes make the unpickler raise
+        raise TrainingError(f"{path}: is damaged, or no {what} ({type(error).__name__})") from None
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -47,11 +69,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
     Checkpoints of before there were checksums are taken as they are.
     """
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        pipeline, _ = state["pipeline"], int(state["step"])
-    except Exception as error:  # whatever damaged bytes make the unpickler raise
-        raise TrainingError(f"{path}: is damaged, or no checkpoint ({type(error).__name__})") from None
+    state = read_plain(path, "checkpoint")
+    if not isinstance(pipeline := state.get("pipeline"), dict) or not isinstance(state.get("step"), int):
+        raise TrainingError(f"{path}: lacks step or pipeline, expected a run's checkpoint")
     if (made := state.get("format", 0)) > FORMAT:
         raise TrainingError(f"{path}: is of format {made}, expected at most {FORMAT}: a newer ebarf_ns made it")
     stored = state.pop("checksum", None)
@@ -60,6 +80,23 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if name := not_finite(pipeline):
         raise TrainingError(f"{path}: holds values that are not finite, in {name}")
     return state
+
+
+def chosen_checkpoint(config: Any) -> tuple[Path | None, list[TrainingError]]:
+    """The checkpoint that a trainer's configuration goes on from, if any, and what is wrong with newer ones.
+
+    Raises :class:`TrainingError` where there is no such file.
+    """
+    damaged: list[TrainingError] = []
+    if config.load_dir is None:
+        path = config.load_checkpoint
+    elif config.load_step is not None:
+        path = config.load_dir / f"step-{config.load_step:09d}.ckpt"
+    else:
+        path, damaged = newest_whole(config.load_dir)
+    if path is not None and not path.is_file():
+        raise TrainingError(f"{path}: is no file, expected a run's checkpoint")
+    return path, damaged
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[TrainingError]]:

@@ -1,7 +1,7 @@
-"""A field too coarse to explain a wrong trajectory by a scene of its own, and how well it predicts held-out events.
+"""A field too coarse to fit a wrong trajectory with a wrong scene, and its loss on held-out events.
 
-Coarse to fine, as in Lin et al. 2021 (BARF), but counted in pixels: its finest level begins at 16 pixels and ends at
-1.5. It is thrown away: fine fields that grew out of it stayed 1 to 6 dB worse.
+Coarse to fine, as in Lin et al. 2021 (BARF), but measured in pixels: the finest level starts at 16 pixels and ends at
+1.5. The field is discarded: fine fields initialised from it stayed 1 to 6 dB worse.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _FEWEST_PAIRS = 20
 
 
 def coarse_model(model: EbarfModel, mode: Literal["refine", "off"] = "refine") -> EbarfModel:
-    """A model of the same scene that sees no more than its coarse levels, all of whose keyframes move, or none.
+    """A model of the same scene with coarse levels only, in which all keyframes move, or none.
 
-    It begins with the clock and the intrinsics of ``model``.
+    It starts with the clock and the intrinsics of ``model``.
     """
     config: EbarfModelConfig = deepcopy(model.config)
     assert config.grid_finest and config.grid_levels and config.density_cells
@@ -53,7 +53,7 @@ def coarse_model(model: EbarfModel, mode: Literal["refine", "off"] = "refine") -
 
 
 class CoarseTraining:
-    """Trains a coarse model, and on request its poses with it."""
+    """Trains a coarse model and, optionally, its poses."""
 
     def __init__(self, coarse: EbarfModel, datamanager: EventDataManager, steps: int, seed: int):
         self.coarse, self.datamanager, self.steps, self.seed = coarse, datamanager, steps, seed
@@ -62,7 +62,7 @@ class CoarseTraining:
         self.grid = coarse.renderer.field.grid
 
     def step(self, step: int, poses: torch.optim.Optimizer | None = None) -> bool:
-        """Step the field, and ``poses`` with it; False, and nothing is moved, where a number is not finite."""
+        """Step the field and ``poses``; returns False without a step if a value is not finite."""
         done = step / self.steps
         self.grid.level_shares = _shares(self.grid, _LAST_PX / between(_FIRST_PX, _LAST_PX, done))
         set_rate(self.field, _RATE * _DECAY**done)
@@ -83,9 +83,9 @@ class CoarseTraining:
 
 
 def heldout_losses(coarse: EbarfModel, training: CoarseTraining) -> Float[np.ndarray, "blocks"] | None:
-    """Train a coarse model whose poses do not move, and return its mean loss of held-out pairs in each block of time.
+    """Train a coarse model with fixed poses, and return its mean loss on held-out pairs per time block.
 
-    NaN for blocks of few pairs; None if a number is not finite.
+    NaN for blocks with few pairs; None if a value is not finite.
     """
     if not all(training.step(step) for step in range(training.steps)):
         return None
@@ -112,7 +112,7 @@ def losses_from_trajectory(
     trajectory: Trajectory,
     given_camera: bool = False,
 ) -> Float[np.ndarray, "blocks"] | None:
-    """:func:`heldout_losses` of a coarse field trained from a trajectory, with learned intrinsics or those given."""
+    """:func:`heldout_losses` of a coarse field trained on a trajectory, with the learned or the given intrinsics."""
     coarse = coarse_model(model, "off")
     keyframes = coarse.camera_optimizer
     keyframes.begin_from(trajectory.poses)
@@ -123,7 +123,7 @@ def losses_from_trajectory(
 
 
 def gain(worse: Float[np.ndarray, "blocks"], better: Float[np.ndarray, "blocks"]) -> float:
-    """By how many standard deviations, from block to block, the second losses are the lower ones."""
+    """Number of standard deviations, over blocks, by which the second losses are lower."""
     difference = worse - better
     known = difference[np.isfinite(difference)]
     if len(known) < 3:
@@ -132,18 +132,18 @@ def gain(worse: Float[np.ndarray, "blocks"], better: Float[np.ndarray, "blocks"]
 
 
 def between(first: float, last: float, done: float) -> float:
-    """From the first to the last by equal ratios."""
+    """Geometric interpolation from the first to the last value."""
     return first * (last / first) ** done
 
 
 def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    """Set the learning rate of everything."""
+    """Set the learning rate of all parameter groups."""
     for group in optimizer.param_groups:
         group["lr"] = rate
 
 
 def _shares(grid: HashGrid, of_finest: float) -> Float[Tensor, "levels"]:
-    """1 for levels up to the given share of the finest resolution, 0 beyond the next, and the first level always."""
+    """Level weights: 1 up to the given share of the finest resolution, 0 beyond the next; the first is always 1."""
     resolution = torch.tensor(grid.shape.resolutions).float()
     level = (resolution / resolution[0]).log() / (resolution[1] / resolution[0]).log()
     last = (of_finest * resolution[-1] / resolution[0]).log() / (resolution[1] / resolution[0]).log()

@@ -1,4 +1,4 @@
-"""Nerfstudio's own encoding and method, timed beside ours."""
+"""Timings of nerfstudio's hash encoding and of nerfacto, as baselines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.Parameter]]:
-    """Nerfstudio's encoding in torch, and its parameters."""
+    """Nerfstudio's hash encoding in torch, and its parameters."""
     encoding = HashEncoding(
         num_levels=shape.levels,
         min_res=shape.coarsest,
@@ -34,9 +34,9 @@ def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.
 
 
 def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float, dict[str, int]]:
-    """Of the registered method, through the trainer, on a scene; and nerfacto's names for the grid planned for it.
+    """Training rays per second of the registered method on a scene, and its planned grid under nerfacto's field names.
 
-    The first half of the steps warms up; of the others the median of eight at a time counts: every eighth does more.
+    The first half of the steps is warm-up; then the median over groups of eight is taken, since every eighth does more.
     """
     from ebarf_ns.nerf.method import ebarf
     from ebarf_ns.nerf.trainer import EbarfTrainerConfig
@@ -68,9 +68,9 @@ def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float,
 
 
 def nerfacto_rays_per_second(shape: dict[str, Any], rays: int, repetitions: int) -> float:
-    """Of stock nerfacto in torch: rays to updated parameters, without its data manager, on the device that ebarf takes.
+    """Training rays per second of stock nerfacto in torch, without its data manager, on the device that ebarf uses.
 
-    Its proposal networks are trained as seldom as they are after 5,000 steps. ``shape`` changes its configuration.
+    Proposal networks are trained as rarely as after 5,000 steps. ``shape`` overrides configuration fields.
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = _without_lpips(NerfactoModelConfig(implementation="torch", **shape)).to(device)
@@ -88,7 +88,7 @@ def nerfacto_rays_per_second(shape: dict[str, Any], rays: int, repetitions: int)
         for optimizer in optimizers:
             optimizer.step()
         times.append(_now() - started)
-    # The mean: some steps also train the proposal networks.
+    # Mean, not median, since only some steps train the proposal networks.
     return rays / mean(times[1:])
 
 
@@ -99,7 +99,7 @@ def _now() -> float:
 
 
 def _without_lpips(config: NerfactoModelConfig) -> Any:
-    """The model, but for a metric whose weights it would fetch from the network."""
+    """The model without the LPIPS metric, whose weights would be downloaded."""
     from torchmetrics.image import lpip
 
     kept = lpip.LearnedPerceptualImagePatchSimilarity

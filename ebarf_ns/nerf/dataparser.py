@@ -103,7 +103,9 @@ class EbarfDataParser(DataParser):
 
     def _keyframe_views(self, keyframes: Trajectory, every: int = 1) -> tuple[Cameras, list[Path]]:
         chosen = Trajectory(keyframes.t_us[::every], Poses(*(column[::every] for column in keyframes.poses)))
-        files = [self.scene.folder / "keyframes" / f"{t_us}.png" for t_us in chosen.t_us.tolist()]
+        # Names of 100,000 files, put together one by one by pathlib, would take seconds.
+        folder = str(self.scene.folder / "keyframes")
+        files = [Path(f"{folder}/{t_us}.png") for t_us in chosen.t_us.tolist()]
         return _nerfstudio_cameras([self.scene.camera] * len(files), chosen.t_us, chosen.poses.matrix()), files
 
     def _evaluation_views(self, keyframes: Trajectory) -> tuple[Cameras, list[Path]]:
@@ -235,11 +237,16 @@ def replace_intrinsics(cameras: Cameras, given: Camera, learned: Camera) -> None
 def _nerfstudio_cameras(
     cameras: list[Camera], t_us: Int64[Tensor, "cameras"], camera_to_world: Float[Tensor, "cameras 3 4"]
 ) -> Cameras:
-    def column(name: str) -> Tensor:
-        return torch.tensor([[getattr(camera, name)] for camera in cameras])
+    # Mostly one and the same, 100,000 times.
+    kinds = {camera: k for k, camera in enumerate(dict.fromkeys(cameras))}
+    which = torch.tensor([kinds[camera] for camera in cameras])
 
+    def column(name: str) -> Tensor:
+        return torch.tensor([[getattr(camera, name)] for camera in kinds])[which]
+
+    fisheye = torch.tensor([[camera.model == "equidistant"] for camera in kinds])[which]
     # At the very centre of a fisheye, nerfstudio divides 0 by 0.
-    aside = torch.tensor([[_ASIDE_PX if camera.model == "equidistant" else 0.0] for camera in cameras])
+    aside = _ASIDE_PX * fisheye
     return Cameras(
         camera_to_worlds=opengl_from_opencv(camera_to_world),
         fx=column("fx"),
@@ -248,12 +255,10 @@ def _nerfstudio_cameras(
         cy=column("cy") + 0.5,
         width=column("width"),
         height=column("height"),
-        distortion_params=torch.tensor([_nerfstudio_distortion(camera) for camera in cameras])
-        if any(camera.distortion for camera in cameras)
+        distortion_params=torch.tensor([_nerfstudio_distortion(camera) for camera in kinds])[which]
+        if any(camera.distortion for camera in kinds)
         else None,
-        camera_type=[
-            CameraType.FISHEYE if camera.model == "equidistant" else CameraType.PERSPECTIVE for camera in cameras
-        ],
+        camera_type=torch.where(fisheye, CameraType.FISHEYE.value, CameraType.PERSPECTIVE.value),
         metadata={"camera_t_us": t_us[:, None]},
     )
 

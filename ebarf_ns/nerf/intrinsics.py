@@ -1,4 +1,4 @@
-"""Intrinsics that are learned: focal length, principal point, and the distortion coefficients that the camera has."""
+"""Learned intrinsics: focal length, principal point, and the camera's distortion coefficients."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _NEWTON_STEPS = 2
 
 
 class Intrinsics(nn.Module):
-    """A correction of a camera's intrinsics, zero at first, counted in pixels in a corner of the image.
+    """A learned correction of a camera's intrinsics, initially zero, in pixels at a corner of the image.
 
-    The two focal lengths keep their ratio. Of the distortion, the first two radial coefficients are learned where the
-    camera's model has any.
+    The ratio of the focal lengths is fixed. The first two radial distortion coefficients are learned if the camera's
+    model has any.
     """
 
     def __init__(self, camera: Camera):
@@ -36,7 +36,7 @@ class Intrinsics(nn.Module):
         else:
             lens = bearing[:, :2] / bearing[:, 2:]
         self.corner_px = max(camera.width, camera.height) / 2
-        # What a coefficient of 1 moves a corner by.
+        # Scale each coefficient so that 1 moves a corner by one pixel.
         reach = self.corner_px / camera.fx
         radial = [1 / (camera.fx * reach**power) for power in (3, 5)] if camera.distortion else []
         tables = {
@@ -54,9 +54,9 @@ class Intrinsics(nn.Module):
         self.correction = nn.Parameter(torch.zeros(1, len(self.unit)))
 
     def bearings(self, number: Int64[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
-        """Unit viewing directions of pixels, given by their row-major numbers, in the camera's frame.
+        """Unit viewing directions in the camera frame of pixels given by row-major index.
 
-        Newton's method from where they were with the intrinsics as given, by the slopes there.
+        Newton's method, starting from the directions with the given intrinsics and using their Jacobians.
         """
         camera, change = self.camera, (self.unit * self.correction)[0]
         centre = change.new_tensor([camera.cx, camera.cy]) + change[1:3]
@@ -74,7 +74,7 @@ class Intrinsics(nn.Module):
         return torch.nn.functional.normalize(torch.cat([lens, torch.ones_like(lens[:, :1])], dim=-1), dim=-1)
 
     def refined(self) -> Camera:
-        """The camera as learned so far."""
+        """The camera with the corrections learned so far."""
         change = (self.unit * self.correction.detach())[0].double().tolist()
         camera, stretch, radial = self.camera, exp(change[0]), change[3:]
         distortion = [given + more for given, more in zip(camera.distortion, radial, strict=False)]

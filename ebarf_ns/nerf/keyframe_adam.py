@@ -1,4 +1,4 @@
-"""Adam that knows that the six numbers of a keyframe belong together, and that neighbours move together."""
+"""Adam with a full-matrix second moment per keyframe and a multilevel preconditioner over neighbouring keyframes."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ if TYPE_CHECKING:
 
 _ROOTS_A_STEP = 256
 _FEW = 4
-"""Rows or stretches that no wider stretches are made of."""
+"""Number of rows or stretches at which coarsening stops."""
 
 
 class KeyframeAdam(torch.optim.Optimizer):
-    """Adam whose second moment is a matrix for each row of its parameters, and for each stretch of rows.
+    """Adam with a matrix-valued second moment for each parameter row and for each stretch of rows.
 
-    A small rotation looks much like a shift: events tell their sum well, and their difference badly. Adam scales each
-    number by itself, so that the noise of the sum sets the pace of the difference too. Here the mean gradient of a row
-    is multiplied by C^(-1/2), C the running mean of its gradients' outer products (full-matrix AdaGrad, Duchi et al.
-    2011, with Adam's forgetting): each direction goes by its own noise.
+    A small rotation looks much like a shift: events constrain their sum well and their difference poorly. Adam scales
+    each parameter separately, so that the noise of the sum also limits the difference. Here the mean gradient of a row
+    is multiplied by C^(-1/2), with C the exponential moving average of its gradients' outer products (full-matrix
+    AdaGrad, Duchi et al. 2011, with Adam's decay): each direction is scaled by its own noise.
 
-    And drift bends whole stretches of a trajectory, which no keyframe's gradient shows above its noise, but their sum
-    does. So rows move by the sum of such steps for all widths P of a stretch, 1, 2, 4, ... rows to either side (the
-    multilevel preconditioner of Bramble, Pasciak & Xu 1990): P C_P^(-1/2) P^T times the mean gradient, each row of
-    P^T the hat over one stretch. Without ``stretches``, for rows of one number, this is Adam.
+    Drift bends whole stretches of a trajectory, which shows in the sum of the keyframe gradients but not in a single
+    one. So rows move by the sum of such steps over all stretch widths, 1, 2, 4, ... rows to either side (the multilevel
+    preconditioner of Bramble, Pasciak & Xu 1990): P C_P^(-1/2) P^T times the mean gradient, where each row of P^T is
+    the hat function of one stretch. Without ``stretches``, and for rows of one parameter, this is Adam.
 
-    ``eps`` is the share of a matrix' mean diagonal that is added to each direction's. Inverse roots are computed
-    anew for no more than 256 rows and stretches a step, in turn; they do not move until their first. Not ``coupled``,
-    each number is scaled by itself. With a ``power`` below 1/2, C^(-power), directions that events tell badly move less
-    than those that they tell well.
+    ``eps`` is added to each eigenvalue as a share of the matrix' mean diagonal. Inverse roots are recomputed for at
+    most 256 rows and stretches per step, in turn; rows do not move before their first one. Without ``coupled``, each
+    parameter is scaled separately. With ``power`` below 1/2, C^(-power), poorly constrained directions move less.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class KeyframeAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Move every row and stretch by about the learning rate in each direction whose gradient keeps its sign."""
+        """Move every row and stretch by about the learning rate in each direction with a consistent gradient sign."""
         assert closure is None
         for group in self.param_groups:
             for rows in group["params"]:
@@ -88,12 +87,12 @@ class KeyframeAdam(torch.optim.Optimizer):
 def _stretches(
     count: int, device: torch.device, dtype: torch.dtype
 ) -> tuple[Float[Tensor, "stretches rows"], Float[Tensor, "rows stretches"]]:
-    """What each row, and each stretch about every second, fourth, ... row, is made of, until there are but few; sparse.
+    """Sparse matrices from rows to stretches around every row, every second, fourth, ... row, down to a few, and back.
 
-    A stretch is a hat: half of each row between two goes to either; one after the last goes to that whole. And the
-    same the other way about, since a product with a transposed view takes many times as long.
+    A stretch is a hat function: a row between two stretches contributes half to each; a row after the last contributes
+    fully to it. The transpose is stored too, since a product with a transposed view is many times slower.
     """
-    # Not needed by those who move keyframes one by one.
+    # Imported here, since it is not needed without stretches.
     from scipy.sparse import csr_matrix, identity, vstack
 
     level, levels = identity(count, format="csr"), []
@@ -117,7 +116,7 @@ def _as_tensor(sparse: csr_matrix, device: torch.device, dtype: torch.dtype) -> 
 
 
 def _inverse_power(outer: Float[Tensor, "rows dim dim"], eps: float, power: float) -> Float[Tensor, "rows dim dim"]:
-    """(C + eps times its mean diagonal)^-power, for C of mean diagonal 1, and C^(-1/2) in its scale; 0 where C is 0."""
+    """(C + eps)^-power for C normalised to mean diagonal 1, then rescaled like C^(-1/2); 0 if C is 0."""
     size = outer.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     safe = torch.where(size > 0, size, torch.ones_like(size))[:, None, None]
     spread, direction = torch.linalg.eigh(outer / safe)

@@ -40,7 +40,8 @@ def free_threads() -> Threads:
     return Threads(count, f"{len(shares)} cores, {busy:.1f} of them busy with other work")
 
 
-def use_threads(threads: Threads) -> None:
-    """Let torch and numba run on so many."""
-    torch.set_num_threads(threads.count)
-    numba.set_num_threads(threads.count)
+def use_threads(count: int | None) -> None:
+    """Let torch and numba run on so many, numba on as many of them as it has; None: as they are."""
+    if count is not None:
+        torch.set_num_threads(count)
+        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # pyright: ignore

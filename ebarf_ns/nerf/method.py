@@ -3,7 +3,7 @@
 from typing import Literal
 
 import torch
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -11,7 +11,8 @@ from ebarf_ns.nerf.datamanager import EventDataManagerConfig
 from ebarf_ns.nerf.model import EbarfModelConfig
 from ebarf_ns.nerf.optimizers import BudgetDecayConfig, FusedAdamConfig, KeyframeAdamConfig
 from ebarf_ns.nerf.pipeline import EbarfPipelineConfig
-from ebarf_ns.nerf.trainer import EbarfTrainerConfig
+from ebarf_ns.nerf.trainer import EbarfTrainer
+from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizerConfig
 from ebarf_ns.nerf.viewer_panel import ViewedPipeline
 
@@ -26,6 +27,7 @@ def _trainer(
     averaged_steps: int = 1,
 ) -> EbarfTrainerConfig:
     return EbarfTrainerConfig(
+        _target=EbarfTrainer,
         method_name=method_name,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=30_000,
@@ -52,7 +54,8 @@ def _trainer(
                 "scheduler": BudgetDecayConfig(),
             },
         },
-        logging=LoggingConfig(steps_per_log=10),
+        # The trainer has a live line of its own.
+        logging=LoggingConfig(steps_per_log=10, local_writer=LocalWriterConfig(enable=False)),
         # Whoever reaches a viewer can drive it.
         viewer=ViewerConfig(num_rays_per_chunk=4096, websocket_host="127.0.0.1"),
         vis="viewer",

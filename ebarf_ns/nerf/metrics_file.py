@@ -1,7 +1,8 @@
 """``metrics.jsonl`` of a run: a header, then one line for each evaluation; and what it knows its scene by."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,10 @@ from ebarf_ns.files import whole_file
 from ebarf_ns.scene import Scene
 
 _NAME = "metrics.jsonl"
-_SAMPLES_OF_EVENTS = 64
+_SAMPLES, _SAMPLE_BYTES = 1 << 13, 1 << 13
+_PLACES = {
+    "threads", "timestamp", "output_dir", "experiment_name", "load_dir", "load_step", "load_checkpoint", "data", "kept",
+}  # fmt: skip
 
 
 def begin_metrics(run: Path, header: Callable[[], dict[str, Any]], start_step: int) -> None:
@@ -40,27 +44,54 @@ def read_header(run: Path) -> dict[str, Any]:
 
 
 def scene_digest(scene: Scene) -> dict[str, str]:
-    """What tells whether a scene is still the same, part by part; of the events, their size and a sample of them."""
+    """What tells whether a scene is still the same, part by part.
+
+    Of a recording of more than 64 MiB, its size and as much, taken from all over it.
+    """
     size = scene.events.stat().st_size
     events = sha256(str(size).encode())
     with scene.events.open("rb") as file:
-        for k in range(_SAMPLES_OF_EVENTS):
-            file.seek(k * size // _SAMPLES_OF_EVENTS)
-            events.update(file.read(4096))
+        for k in range(_SAMPLES):
+            file.seek(k * max(size // _SAMPLES, _SAMPLE_BYTES))
+            events.update(file.read(_SAMPLE_BYTES))
     small = {"scene.json": scene.folder / "scene.json", "trajectory": scene.trajectory}
     digests = {part: _digest(path.read_bytes()) for part, path in small.items()}
-    return {**digests, "events": events.hexdigest()[:16]}
+    return {**digests, "recording": events.hexdigest()[:16]}
 
 
-def config_digest(configuration: dict[str, Any]) -> str:
+def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
+    """What of a scene is not as it was for the run with this header; empty too where the run did not say."""
+    before = header.get("scene_digest")
+    if not isinstance(before, dict):
+        return []
+    now = scene_digest(scene)
+    return [part for part in now if part in before and before[part] != now[part]]
+
+
+def flags_of(configuration: Any) -> dict[str, Any]:
+    """The settings of a run by the names of their flags, in plain values; not those that say where it lies."""
+    return {name: value for name, value in _flags(configuration) if name.split(".")[-1] not in _PLACES}
+
+
+def config_digest(flags: dict[str, Any]) -> str:
     """What tells whether a run was configured alike."""
-    return _digest(json.dumps(configuration, default=_named).encode())
+    return _digest(json.dumps(flags).encode())
+
+
+def _flags(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, dict) and value:
+        for key, one in value.items():
+            yield from _flags(one, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple):
+        yield name, [dict(_flags(one)).get("", str(one)) for one in value]
+    elif value is None or isinstance(value, bool | int | float | str):
+        yield name, value
+    else:
+        # The text of classes and functions may hold an address.
+        yield name, getattr(value, "__qualname__", None) or str(value)
 
 
 def _digest(content: bytes) -> str:
     return sha256(content).hexdigest()[:16]
-
-
-def _named(value: object) -> str:
-    """Of classes and functions, whose text may hold an address."""
-    return getattr(value, "__qualname__", None) or str(value)

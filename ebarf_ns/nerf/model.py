@@ -19,7 +19,7 @@ from ebarf_ns.nerf.intrinsics import Intrinsics
 from ebarf_ns.nerf.old_flags import old_names
 from ebarf_ns.nerf.trajectory_optimizer import TrajectoryOptimizer, TrajectoryOptimizerConfig
 from ebarf_ns.photometry.brightness import BrightnessKind, log_brightness
-from ebarf_ns.photometry.event_loss import nearest_allowed, normalized_loss, reported_change, threshold_loss
+from ebarf_ns.photometry.event_loss import normalized_loss, reported_change, target_change, threshold_loss
 from ebarf_ns.photometry.sensor_response import SensorResponse, thresholds_of_ratio
 from ebarf_ns.radiance.field import IntensityRange, Precision, RadianceField
 from ebarf_ns.radiance.lattice import HashGridShape
@@ -250,7 +250,7 @@ class EbarfModel(Model):
         else:
             loss = threshold_loss(
                 change,
-                nearest_allowed(change, reported, batch["silent"], *outputs["sensor"]),
+                target_change(change, reported, batch["silent"], *outputs["sensor"]),
                 batch["variance"].to(change),
                 self.mean_threshold,
                 self.config.huber_delta,

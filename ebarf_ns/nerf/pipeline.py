@@ -1,5 +1,6 @@
 """Training steps and evaluation of a model on its scene."""
 
+import sys
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.nerf.checkpoints import unsealed
 from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras, replace_intrinsics
+from ebarf_ns.nerf.metrics_file import changed_parts, read_header
 from ebarf_ns.nerf.model import EbarfModel
 from ebarf_ns.scene import Frame, Scene
 
@@ -50,6 +52,8 @@ class EbarfPipeline(VanillaPipeline):
             super().__init__(*args, **kwargs)
             if self.test_mode == "val":
                 self._check_references()
+            else:
+                self._say_what_changed()
         self.last_loss: Tensor | None = None
         """Of the last training step's event pairs."""
         self.register_buffer("cost", torch.zeros(2, dtype=torch.float64))
@@ -67,6 +71,13 @@ class EbarfPipeline(VanillaPipeline):
         if self.scene.groundtruth:
             read_tum(self.scene.groundtruth)
 
+    def _say_what_changed(self) -> None:
+        """To evaluate or show a run by another scene than it was trained on may be right, and may be a mistake."""
+        kept = self.datamanager.config.dataparser.kept  # pyright: ignore[reportAttributeAccessIssue]
+        if kept and self.scene.events.is_file() and self.scene.folder != kept:
+            for part in changed_parts(self.scene, read_header(kept.parent)):
+                sys.stderr.write(f"{self.scene.folder}: {part} changed since {kept.parent} was trained\n")
+
     @property
     def scene(self) -> Scene:
         """The scene folder."""
@@ -80,9 +91,14 @@ class EbarfPipeline(VanillaPipeline):
     def _mount_scale(self) -> float:
         return self.datamanager.train_dataset.metadata["mount_scale"]
 
+    @property
+    def seed(self) -> int:
+        """Of this process among those that train together."""
+        return self.datamanager.config.seed * self.world_size + self.datamanager.rank
+
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """One training step's outputs, losses and metrics."""
-        self.model.begin_step(step, self.datamanager.config.seed * self.world_size + self.datamanager.rank)
+        self.model.begin_step(step, self.seed)
         outputs, losses, metrics = super().get_train_loss_dict(step)
         self.last_loss = losses["event_loss"].detach()
         return outputs, losses, metrics

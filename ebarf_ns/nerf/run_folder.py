@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -10,7 +11,8 @@ from filelock import FileLock, Timeout
 from ebarf_ns.errors import TrainingError
 
 _LOCK = ".lock"
-_LEFT_OVER = re.compile(r"\..+\.\w{8}(\.\w+)?")
+# Temporary names, and that of a checkpoint on its way into its folder.
+_LEFT_OVER = re.compile(r"\..+\.\w{8}(\.\w+)?|step-\d+\.ckpt")
 
 
 def take_folder(folder: Path, goes_on: bool, overwrite: bool) -> FileLock:
@@ -35,7 +37,8 @@ def take_folder(folder: Path, goes_on: bool, overwrite: bool) -> FileLock:
             )
         for path in older:
             path.unlink()
-    for path in folder.iterdir():
-        if path.is_file() and _LEFT_OVER.fullmatch(path.name):
-            path.unlink()
+    for place in (folder, folder / "renders", folder / "report"):
+        for path in place.iterdir() if place.is_dir() else ():
+            if _LEFT_OVER.fullmatch(path.name):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
     return lock

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from functools import reduce
 from typing import TYPE_CHECKING, Any
@@ -52,7 +53,12 @@ _LEAST = {
     "pipeline.model.camera_optimizer.every": 1,
     "pipeline.model.camera_optimizer.align_steps": 0,
     "averaged_steps": 1,
+    "threads": 1,
 }
+_FREE = re.compile(
+    r"(max_|steps_per_|evaluations|overwrite|allow_|vis|viewer|logging|load_|project_name|start_paused|save_only|"
+    r"log_gradients|machine\.(num|machine|dist)|pipeline\.datamanager\.(index_memory|eval_))"
+)
 
 
 def check_settings(config: TrainerConfig) -> None:
@@ -95,3 +101,12 @@ def check_machine(machine: MachineConfig) -> None:
         raise TrainingError(
             f"--machine.num-devices is {machine.num_devices}, expected 1 to {most}, as many as are here"
         )
+
+
+def changed_flags(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """The flags of a run that are others now, with what they were; empty where none is, or where it did not say.
+
+    Those of the budget, and of what is written and shown, may change as a run goes on.
+    """
+    changed = [name for name in now if name in before and before[name] != now[name] and not _FREE.match(name)]
+    return ", ".join(f"--{name.replace('_', '-')} {before[name]} (now {now[name]})" for name in changed)

@@ -1,8 +1,7 @@
-"""After training: what events that were held out say of the refined trajectory.
+"""Verification after training: how well held-out events support the refined trajectory.
 
-The field that was trained along with the refined keyframes agrees with them, right or wrong. So coarse fields are
-trained alike, each from a trajectory that does not move: the refined one, the one given, and the refined one moved
-where events tell little.
+A field trained jointly with the keyframes agrees with them, right or wrong. So coarse fields are trained with fixed
+trajectories: the refined one, the given one, and the refined one perturbed in weakly constrained directions.
 """
 
 from __future__ import annotations
@@ -35,61 +34,59 @@ _CERTAIN = 4.0
 _USUAL_TIMES, _MUCH_WORSE = 3.0, 1.1
 _ASKED_PX, _LEAST_DEVIATIONS = 2.0, 0.25
 _SOME_RAYS = 512
-# Name, axis turned about, axis shifted along, and the shift's sign: right, down and forward are 0, 1 and 2.
+# Name, rotation axis, translation axis, and the sign of the translation: right, down and forward are 0, 1 and 2.
 _BAS_RELIEFS = (
-    ("a turn about the vertical with a shift sideways", 1, 0, -1.0),
-    ("a tilt with a shift up or down", 0, 1, 1.0),
+    ("a pan with a sideways shift", 1, 0, -1.0),
+    ("a tilt with a vertical shift", 0, 1, 1.0),
 )
 
 
 @dataclass(frozen=True)
 class WeakDirection:
-    """A turn that goes with a shift, so that the image hardly moves, by as much as events cannot tell."""
+    """Uncertainty of a rotation and a compensating shift, under which the image hardly moves."""
 
     name: str
     turn_deg: float
-    """Root mean square over the keyframes, one standard deviation."""
+    """RMS rotation over the keyframes, one standard deviation."""
     shift: float
-    """What goes with it, in the unit of the trajectory."""
+    """The compensating shift, in the trajectory's unit."""
     or_more: bool
-    """Whether events did not tell as much as was asked for."""
+    """Whether the size is only a lower bound."""
 
     def __str__(self) -> str:
         more = " or more" if self.or_more else ""
         size = f"{self.turn_deg:.2g} deg with {self.shift:.2g}{more}"
-        return f"least certain is {self.name}: {size}, one standard deviation"
+        return f"least certain: {self.name}, {size} (one standard deviation)"
 
 
 @dataclass(frozen=True)
 class Support:
-    """How well held-out events are predicted from the trajectory as given and as refined, and what that says."""
+    """How well held-out events are predicted with the given and the refined trajectory, and the conclusion."""
 
     loss_given: float
     loss_refined: float
     deviations: float
-    """By how many standard deviations, from stretch to stretch of time, the refined trajectory is the better one."""
+    """Number of standard deviations, over time blocks, by which the refined trajectory is better."""
     worse_at_s: tuple[float, ...]
-    """Middles of the stretches of time, in seconds on the clock of the events, that are much better predicted from the
-    trajectory given."""
+    """Centres of the time blocks, in seconds on the event clock, that the given trajectory predicts much better."""
     shifted: float
-    """Root mean square distance of the refined positions from those given, less a similarity, in the trajectory's
-    unit."""
+    """RMS distance between refined and given positions after removing a similarity, in the trajectory's unit."""
     weakest: WeakDirection | None
 
     @property
     def verdict(self) -> Literal["better", "alike", "worse"]:
-        """What the events say of the refined trajectory, against the one given."""
+        """Whether the refined trajectory is better than the given one, as judged by held-out events."""
         if abs(self.deviations) < _CERTAIN:
             return "alike"
         return "better" if self.deviations > 0 else "worse"
 
     def __str__(self) -> str:
         said = {
-            "better": "events that were held out speak for the refined trajectory",
-            "alike": "events that were held out do not tell the refined trajectory from the one given",
-            "worse": "events that were held out speak for the trajectory given, which is in trajectory_initial.txt",
+            "better": "held-out events support the refined trajectory",
+            "alike": "held-out events do not distinguish the refined trajectory from the given one",
+            "worse": "held-out events support the given trajectory, which is in trajectory_initial.txt",
         }[self.verdict]
-        losses = f"loss {self.loss_refined:.3g}, {self.loss_given:.3g} with the one given"
+        losses = f"loss {self.loss_refined:.3g}, {self.loss_given:.3g} with the given one"
         where = ", ".join(f"{one:g} s" for one in self.worse_at_s)
         lines = [
             f"{said} ({losses}, {abs(self.deviations):.1f} deviations)" + (f"; worse about {where}" if where else "")
@@ -98,13 +95,13 @@ class Support:
             lines.append(str(self.weakest))
             if self.shifted < self.weakest.shift:
                 lines.append(
-                    f"positions moved by {self.shifted:.2g}, less than that: they may be no better than those given"
+                    f"positions moved by {self.shifted:.2g}, less than that: they may be no better than the given ones"
                 )
         return "\n".join(lines)
 
 
 def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: int) -> Support | None:
-    """Ask held-out events by coarse fields of so many steps each; None if a number is not finite."""
+    """Test the refined trajectory on held-out events with coarse fields of ``steps`` steps; None if one diverges."""
     keyframes = model.camera_optimizer
     given = Trajectory(keyframes.keyframe_t_us - keyframes.clock_offset_us, keyframes.initial())
     losses_from = partial(losses_from_trajectory, model, datamanager, steps, seed)
@@ -125,11 +122,11 @@ def support(model: EbarfModel, datamanager: EventDataManager, steps: int, seed: 
 
 
 def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from: LossesFrom) -> WeakDirection | None:
-    """Which of two motions that a young field mistakes for relief is told worst (the bas-relief ambiguity, Belhumeur,
-    Kriegman and Yuille 1999): the camera turns as it moves aside, or tilts as it moves up, and shifts back by as much.
+    """The less constrained of two motions that are easily confused with scene relief (the bas-relief ambiguity,
+    Belhumeur, Kriegman and Yuille 1999): a pan with a sideways shift, or a tilt with a vertical shift.
 
-    From the trajectory moved so by two pixels, held-out events are predicted worse by z standard deviations. Losses
-    grow as squares do, so that the motion of one deviation is smaller by the square root of z.
+    With the trajectory perturbed by two pixels, held-out events are predicted worse by z standard deviations. Losses
+    are quadratic, so that one standard deviation of motion is two pixels over the square root of z.
     """
     refined = model.camera_optimizer.trajectory()
     position, quat_wxyz = refined.poses
@@ -151,18 +148,18 @@ def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from:
 
 
 def _scale(model: EbarfModel) -> float:
-    """Training coordinates over the trajectory's unit."""
+    """Training units per trajectory unit."""
     return float(model.kwargs["metadata"]["normalization"].scale)
 
 
 def _shifted(given: Trajectory, refined: Trajectory) -> float:
-    left = differences_less_similarity(given.poses, refined.poses)[:, 3:]
-    return round(float(left.square().sum(dim=-1).mean().sqrt()), 6)
+    residual = differences_less_similarity(given.poses, refined.poses)[:, 3:]
+    return round(float(residual.square().sum(dim=-1).mean().sqrt()), 6)
 
 
 @torch.no_grad()
 def _median_depth(model: EbarfModel, datamanager: EventDataManager) -> float:
-    """Of what held-out events see, in training coordinates."""
+    """Median depth at held-out events, in training coordinates."""
     rays, _ = datamanager.next_eval(0)
     every = max(1, len(rays) // _SOME_RAYS)
     assert rays.metadata is not None

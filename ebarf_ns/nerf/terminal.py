@@ -95,9 +95,12 @@ class LiveLine:
         self._progress.disable = not CONSOLE.is_terminal
         self._task = self._progress.add_task("training", total=1.0, said="")
 
-    def start(self) -> None:
-        """Show it."""
+    def __enter__(self) -> LiveLine:
         self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     def stop(self) -> None:
         """Take it away."""

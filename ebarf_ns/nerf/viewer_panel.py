@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import tempfile
 import threading
 import time
@@ -20,6 +21,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
+from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, rotate
 from ebarf_ns.geometry.trajectory import Poses
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.viewer_pictures import curves, half_window_us, recorded, rendered, side_by_side
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
 
 # A chore that took a second comes again after so many.
-_REST, _LEAST_REST_S = 30.0, 1.0
+_REST, _LEAST_REST_S = 50.0, 1.0
 _MOST_RECORDS = 400
 _CPU_MAX_RES = 256
 
@@ -83,6 +85,8 @@ class ViewerPanel(ViewerControl):
         self.viser_server.gui.configure_theme(control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105))
         chores = (self._drawn.draw_lines, self._draw_curves, self._pipeline.fit_display_range, self._show_moment_again)
         self._chores = [_Chore(do) for do in chores]
+        # Fog before the camera would hide the trajectories, and a coarse picture's depth cuts them to pieces.
+        viewer.control_panel._layer_depth.value = False
         if viewer.trainer and self._pipeline.device.type == "cpu":
             # A picture of 512 pixels takes seconds there, and training gets nine tenths of the time.
             viewer.control_panel._max_res.value = _CPU_MAX_RES
@@ -94,7 +98,7 @@ class ViewerPanel(ViewerControl):
         gui, scene = self.viser_server.gui, self.viser_server.scene
         model = self._pipeline.model
         times = model.camera_optimizer.keyframe_t_us
-        self._given = model.camera_optimizer.given.nonzero()[:, 0].cpu()
+        self._given = model.camera_optimizer.given.cpu()
         shown = {
             "initial": "initial, blue",
             "refined": "refined, orange",
@@ -111,6 +115,7 @@ class ViewerPanel(ViewerControl):
             last = len(self._given) - 1
             self._keyframe = gui.add_number("keyframe", last // 2, min=0, max=last, step=1)
             gui.add_button("Fly to keyframe").on_click(self._fly_to_keyframe)
+            gui.add_button("See all keyframes").on_click(lambda event: self._step_back(event.client))
             gui.add_button("Save refined trajectory").on_click(self._save)
             if model.camera_optimizer.config.mode == "refine" and self.viewer.trainer:
                 self._freeze = gui.add_button("Freeze poses")
@@ -178,6 +183,18 @@ class ViewerPanel(ViewerControl):
         self._time.value = 1e-6 * float(times[keyframe] - times[0])
         if client is not None and not self._follow.value:
             self._look(client, self._pose_at(self._t_us()))
+
+    def _step_back(self, client: viser.ClientHandle | None) -> None:
+        """Look as the camera does now, from so far behind that all keyframes are in view."""
+        if client is None:
+            return
+        position, quat_wxyz = self._pose_at(self._t_us())
+        places = self._drawn.places()
+        turned = rotate(quat_wxyz_conjugate(quat_wxyz).expand(len(places), 4), places - position)
+        aside = turned[:, :2].abs().amax(dim=-1) / math.tan(vertical_fov_rad(self._pipeline) / 2)
+        back = torch.zeros(3, dtype=torch.float64)
+        back[2] = -1.2 * (aside - turned[:, 2]).amax()
+        self._look(client, Poses(position + rotate(quat_wxyz, back), quat_wxyz))
 
     def _go_to_time(self) -> None:
         if self._follow.value:

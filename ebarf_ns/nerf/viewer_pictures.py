@@ -13,19 +13,19 @@ import torch
 from ebarf_ns.errors import EbarfError
 from ebarf_ns.evaluation.frames import read_frame
 from ebarf_ns.events.recording import RecordingFile, accumulate
+from ebarf_ns.nerf.moments import brightness_at, pixel_lattice, predicted_events
 from ebarf_ns.nerf.views import for_people
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jaxtyping import Float, UInt8
+    from jaxtyping import UInt8
     from torch import Tensor
 
     from ebarf_ns.nerf.pipeline import EbarfPipeline
 
 _WIDEST_PX = 128
 _LONGEST_HALF_US = 10_000
-_RAYS_AT_ONCE = 4096
 _DARK, _LIGHT = (36,), (230,)
 _CURVES = (
     ("loss", "loss", "log"),
@@ -75,29 +75,15 @@ def recorded(pipeline: EbarfPipeline, t_us: int, half_us: int) -> Moment:
 
 @torch.no_grad()
 def rendered(pipeline: EbarfPipeline, t_us: int, half_us: int) -> dict[str, UInt8[np.ndarray, "height width"]]:
-    """What the field shows then: log brightness, and the events that its change over the same time would make."""
-    before, now, after = (_brightness_at(pipeline, t_us + shift_us) for shift_us in (-half_us, 0, half_us))
-    on, off = pipeline.model.sensor()
-    change = after - before
-    events = torch.where(change > 0, change / on, change / off)
+    """What the field shows then, with fewer pixels than a large camera has: log brightness, and the events that its
+    change over the same time would make."""
+    pixel = pixel_lattice(pipeline.scene.camera, _WIDEST_PX)
+    events = predicted_events(pipeline, t_us, half_us, pixel)
+    grey = pipeline.model.grey(brightness_at(pipeline, t_us, pixel))
     return {
         "events predicted": (128 + (32 * events).clamp(-128, 127)).to(torch.uint8).cpu().numpy(),
-        "log brightness": (255 * pipeline.model.grey(now)).to(torch.uint8).cpu().numpy(),
+        "log brightness": (255 * grey).to(torch.uint8).cpu().numpy(),
     }
-
-
-def _brightness_at(pipeline: EbarfPipeline, t_us: int) -> Float[Tensor, "height width"]:
-    """As the event camera has it at that moment, with fewer pixels where it has many."""
-    camera, model = pipeline.scene.camera, pipeline.model
-    every = -(-camera.width // _WIDEST_PX)
-    rows = torch.arange(every // 2, camera.height, every)
-    columns = torch.arange(every // 2, camera.width, every)
-    pixel = (rows[:, None] * camera.width + columns).flatten()
-    parts = [
-        model(pipeline.datamanager.rays_at(part, torch.full_like(part, t_us)))["brightness"][:, 0]
-        for part in pixel.split(_RAYS_AT_ONCE)
-    ]
-    return torch.cat(parts).view(len(rows), len(columns))
 
 
 def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width"]], width: int = 2 * 300) -> bytes:
@@ -141,8 +127,10 @@ def curves(records: Sequence[dict[str, Any]], width: int = 2 * 300) -> bytes:
         axes.set_facecolor("#1a1a1a")
         axes.tick_params(which="both", colors="#bbbbbb", labelsize=13)
         axes.grid(color="#3a3a3a")
-        axes.set_yscale(scale)
-        if scale == "linear":
+        heights = [height for line in axes.lines for height in line.get_ydata()]
+        if scale == "log" and heights and 0 < 10 * min(heights) < max(heights):
+            axes.set_yscale("log")
+        else:
             axes.set_ylim(bottom=0)
     if rows[-1].lines:
         rows[-1].legend(fontsize=13, labelcolor="#dddddd", facecolor="#242424", edgecolor="#3a3a3a")

@@ -37,7 +37,7 @@ class DrawnScene:
 
     def __init__(self, pipeline: EbarfPipeline, server: viser.ViserServer, most: int, frustum_scale: float):
         self.pipeline, self.server, self.frustum_scale = pipeline, server, frustum_scale
-        given = pipeline.model.camera_optimizer.given.nonzero()[:, 0].cpu()
+        given = pipeline.model.camera_optimizer.given.cpu()
         count = min(len(given), _MOST_FRUSTUMS if most < 0 else min(most, _MOST_FRUSTUMS))
         self.keyframes = given[np.linspace(0, len(given) - 1, count).astype(int)]
         """Numbers of the keyframes that are drawn, evenly over those that came with the scene."""
@@ -47,6 +47,10 @@ class DrawnScene:
     def _poses(self) -> Poses:
         keyframes = self.pipeline.model.camera_optimizer.trajectory().poses
         return Poses(*(column[self.keyframes.to(column.device)].double().cpu() for column in keyframes))
+
+    def places(self) -> Float[Tensor, "keyframes 3"]:
+        """Where the drawn keyframes are now, in training coordinates."""
+        return self._poses().position
 
     def draw_keyframes(self, on_click: Callable[[int, viser.ClientHandle | None], None]) -> None:
         """A frustum each, with the events around it; a click is told the keyframe's number."""

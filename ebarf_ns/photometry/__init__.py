@@ -1,1 +1,1 @@
-"""From brightness to events: sensor response and event loss."""
+"""Log brightness, sensor response and event losses."""

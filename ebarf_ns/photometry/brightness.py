@@ -1,4 +1,4 @@
-"""From rendered intensity to log brightness, finite with finite gradients for every intensity from 0 up."""
+"""Rendered intensity to log brightness, with finite values and gradients for every intensity from 0 up."""
 
 from __future__ import annotations
 
@@ -29,5 +29,5 @@ def lin_log(intensity: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def log_brightness(intensity: Float[Tensor, "*batch"], kind: BrightnessKind) -> Float[Tensor, "*batch"]:
-    """Log brightness; ``log`` is ln(intensity + 0.001), with slope at most 1000."""
+    """Log brightness of an intensity; ``log`` is ln(intensity + 0.001), with slope at most 1000."""
     return lin_log(intensity) if kind == "lin_log" else (intensity + _DARKEST).log()

@@ -1,4 +1,4 @@
-"""What the rendered change of log brightness should have been: the losses of Eq. 5 and Eq. 6."""
+"""The event losses (Eq. 5 and Eq. 6) and their targets for the change of log brightness."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ def reported_change(
     threshold_on: Tensor | float,
     threshold_off: Tensor | float,
 ) -> Float[Tensor, "pairs"]:
-    """Change of log brightness that the events in a pair report: C_on for each brighter, -C_off for each darker one.
+    """Change of log brightness that the events in a pair report: C_on per ON event, -C_off per OFF event.
 
-    To the thresholds, the gradient is of events that cancel one another alone: an on and an off event, that brightness
-    comes back, tell the ratio of the thresholds. The sum that is left does not: were its events to tell it, contrast
-    that renders still lack in bright and in dark places would pass for a ratio.
+    Only cancelling events (an ON and an OFF event, as brightness returns) have a gradient to the thresholds, since they
+    determine the threshold ratio. The net sum has none: otherwise, contrast that renders still lack in bright and dark
+    regions would be mistaken for a threshold ratio.
     """
     cancelled = (event_count - polarity_sum.abs()) / 2
-    left = polarity_sum.clamp(min=0) * threshold_on + polarity_sum.clamp(max=0) * threshold_off
-    return left.detach() + cancelled * (threshold_on - threshold_off)
+    net = polarity_sum.clamp(min=0) * threshold_on + polarity_sum.clamp(max=0) * threshold_off
+    return net.detach() + cancelled * (threshold_on - threshold_off)
 
 
-def nearest_allowed(
+def target_change(
     change: Float[Tensor, "pairs"],
     reported: Float[Tensor, "pairs"],
     silent: Bool[Tensor, "pairs"],
     threshold_on: Tensor | float,
     threshold_off: Tensor | float,
 ) -> Float[Tensor, "pairs"]:
-    """The change that events allow and that is nearest to the rendered one, as a target: no gradient to ``change``.
+    """Target for the rendered change, clamped to what the events allow; no gradient to ``change``.
 
-    A pair that ends with an event changed by what was reported. While its pixel is ``silent`` since, it rose by less
-    than C_on beyond that, and fell by less than C_off (the no-event loss of E-NeRF, Klenk et al. 2023). Most likely it
-    did not change at all: within those limits an error counts by half, lest fog gather where nothing is reported.
+    A pair that ends at an event changed by what was reported. At a ``silent`` pixel, brightness has since risen by less
+    than C_on and fallen by less than C_off (the no-event loss of E-NeRF, Klenk et al. 2023). Most likely it did not
+    change at all: errors within those limits count half, so that no fog builds up in regions without events.
     """
     most, least = (torch.as_tensor(threshold).detach().to(change) for threshold in (threshold_on, threshold_off))
     return reported + _SILENT_SHARE * silent * (change - reported).detach().clamp(-least, most)
@@ -55,13 +55,13 @@ def threshold_loss(
     huber_delta: float | None = None,
     render_variance: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Eq. 5 in units of the threshold, each pair weighted by one over its variance, for one event 1; 0 for no pairs.
+    """Eq. 5 in units of the threshold, each pair weighted by its inverse variance (1 for one event); 0 for no pairs.
 
-    The errors of the single thresholds add up over the events of a pair, so its variance grows with their number. To
-    that comes ``render_variance``, in variances of one event: what renders are wrong by however many events there are.
-    So long pairs, which tell brightness at large, weigh little less than short ones. Errors beyond ``huber_delta``
-    standard deviations count by their size, no longer by its square (Huber 1964): what a render gets wrong at
-    silhouettes must not bend the trajectory. Pairs without any event weigh no more than those of one.
+    Threshold errors add up over the events of a pair, so its variance grows with their number. ``render_variance``, in
+    units of one event's variance, adds the render error, which is independent of that number. Long pairs, which
+    constrain low-frequency brightness, then weigh little less than short ones. Errors beyond ``huber_delta`` standard
+    deviations count linearly (Huber 1964), so that render errors at silhouettes do not distort the trajectory. Pairs
+    without events weigh no more than those with one.
     """
     deviations = ((render_variance + variance).clamp_min(1) / (render_variance + 1)).sqrt()
     error = (change - reported) / (threshold * deviations)
@@ -75,11 +75,11 @@ def threshold_loss(
 def normalized_loss(
     change: Float[Tensor, "pairs"], reported: Float[Tensor, "pairs"], threshold: float = 0.25
 ) -> Float[Tensor, ""]:
-    """Eq. 6 for unknown thresholds: both changes scaled to unit length over the batch before they are compared.
+    """Eq. 6 for unknown thresholds: both changes are normalised to unit length over the batch and compared.
 
-    The paper writes the norm per event, where it would leave nothing but the sign; what its implementation computes,
-    and what works, is the norm over the batch. Smoothed by delta = 0.001 sqrt(N) C so that the gradient stays below
-    2 / delta at zero change. Fewer than two pairs or no net polarity carry no information: 0.
+    The paper writes the norm per event, which would leave only the sign; its implementation, and what works, uses the
+    norm over the batch. It is smoothed by delta = 0.001 sqrt(N) C, so that the gradient stays below 2 / delta at zero
+    change. Fewer than two pairs or no net polarity carry no information and give 0.
     """
     if len(change) < 2 or not bool(reported.any()):
         return 0 * change.sum()

@@ -1,4 +1,4 @@
-"""What is not known of an event sensor, and found out in training."""
+"""Sensor parameters learned in training: threshold ratio and photoreceptor time constant."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ _LEVEL_SHARE = 0.05
 
 
 class Response(NamedTuple):
-    """By how much log brightness changes for one event."""
+    """Contrast thresholds: change of log brightness per event."""
 
     threshold_on: Tensor | float
     threshold_off: Tensor | float
 
 
 class SensorResponse(nn.Module):
-    """Thresholds whose ratio is known up to a relative ``deviation``, and learned within it; at 0, they stand.
+    """Thresholds whose ratio is known up to a relative ``deviation`` and learned within it; fixed at 0.
 
-    The ratio of on and off matters: where brightness comes back to what it was, events must add up to nothing. But a
-    camera that turns one way sees any ratio explained by brightness that rises or falls all along its way, so that a
-    ratio learned without a bound leaves the truth: the further it is off, the better the ramp fits. What was counted in
-    the recording holds it: leaving that costs :meth:`prior`, and 2 deviations is the end.
+    The ON/OFF ratio matters: where brightness returns to an earlier value, events must sum to zero. But for a camera
+    that pans one way, any ratio can be explained by a brightness ramp along the pan, and without a bound the learned
+    ratio drifts away: the further it is off, the better the ramp fits. The ratio counted in the recording therefore
+    acts as a prior (:meth:`prior`) and limits the learned one to 2 deviations.
 
-    The photoreceptor is a low pass of first order, its time constant inversely proportional to the intensity (Low & Lee
-    2024). ``time_constant_us`` is that at the mean log brightness; None: learned. At 0 nothing is computed.
+    The photoreceptor is a first-order low-pass filter whose time constant is inversely proportional to intensity (Low &
+    Lee 2024). ``time_constant_us`` applies at the mean log brightness; None: learned; 0: no delay is computed.
     """
 
     def __init__(
@@ -53,48 +53,48 @@ class SensorResponse(nn.Module):
         else:
             self.register_buffer("time_constant", start)
         self.time_constant: Tensor
-        # A running sum and its weight: the mean is known as soon as there is anything to take it of.
+        # Exponential moving sum and its weight, which give an unbiased mean from the first step.
         self.register_buffer("seen_brightness", torch.zeros(2))
         self.seen_brightness: Tensor
 
     @property
     def learns_ratio(self) -> bool:
-        """Whether the ratio of the thresholds is refined."""
+        """Whether the threshold ratio is learned."""
         return self.deviation > 0
 
     def forward(self) -> Response:
-        """What the thresholds are taken to be by now."""
+        """The current thresholds."""
         if not self.learns_ratio:
             return self.nominal
         bounded = _MOST_DEVIATIONS * torch.tanh(self.deviations / _MOST_DEVIATIONS)
-        uneven = torch.exp(self.deviation / 2 * bounded)
-        return Response(self.nominal.threshold_on * uneven, self.nominal.threshold_off / uneven)
+        root_ratio = torch.exp(self.deviation / 2 * bounded)
+        return Response(self.nominal.threshold_on * root_ratio, self.nominal.threshold_off / root_ratio)
 
     def begin_step(self, step: int) -> None:
-        """Let the time constant learn in every eighth step, from 0 up: its gradient takes that of all rays."""
+        """Enable learning of the time constant in every eighth step, since its gradient needs those of all rays."""
         if not self.learns_time_constant:
             return
         learns = step % _LEARN_EVERY == 0
         if learns:
-            # Not where it is used: there, at 0, a clamp has no gradient.
+            # Clamped here, not where it is used: a clamp in the graph has no gradient at 0.
             with torch.no_grad():
                 self.time_constant.clamp_(min=0)
         self.time_constant.requires_grad_(learns)
 
     @property
     def time_constant_us(self) -> Tensor:
-        """Of the photoreceptor, at the mean log brightness."""
+        """Time constant of the photoreceptor at the mean log brightness."""
         return self.time_constant * _UNIT_US
 
     @property
     def delays(self) -> bool:
-        """Whether there is a delay that matters, or one to learn in this step."""
+        """Whether the delay is significant or learned in this step."""
         return self.time_constant.requires_grad or bool(self.time_constant_us > _LEAST_US)
 
     def delay_us(self, brightness: Float[Tensor, "rays"]) -> Float[Tensor, "rays"]:
-        """How long ago a pixel that looks at that log brightness saw what it reports: to first order, a time constant.
+        """Delay of a pixel at a given log brightness, to first order its time constant.
 
-        At most 8 times that at the mean brightness: the dark current keeps pixels from becoming ever slower.
+        At most 8 times that at the mean brightness, since the dark current bounds the time constant.
         """
         here = torch.stack([brightness.mean(), torch.ones_like(self.seen_brightness[1])])
         seen = self.seen_brightness.lerp(here, _LEVEL_SHARE)
@@ -105,7 +105,7 @@ class SensorResponse(nn.Module):
         return self.time_constant_us * slower
 
     def prior(self) -> Tensor:
-        """Half the squared number of deviations from the nominal ratio."""
+        """Half the squared deviation from the nominal ratio, in standard deviations."""
         return self.deviations.square() / 2
 
 

@@ -1,1 +1,1 @@
-"""The field and its rendering: hash grid, samples along rays."""
+"""The radiance field and its rendering: hash grid, ray sampling, volume rendering."""

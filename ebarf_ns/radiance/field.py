@@ -1,4 +1,4 @@
-"""The radiance field: position (and, where the scene needs it, direction) to density and one-channel intensity."""
+"""The radiance field: position and, optionally, direction to density and one-channel intensity."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _MAX_LOG_DENSITY = 12.0
 
 
 def fastest_precision(device: torch.device | str) -> Precision:
-    """bfloat16 where the processor multiplies it natively, else float32."""
+    """bfloat16 if the processor supports it natively, else float32."""
     if torch.device(device).type == "cuda":
-        # Before torch 2.5, the second question is an error where the answer to the first one is no.
+        # Before torch 2.5, is_bf16_supported raises without a GPU.
         return "bfloat16" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "float32"
-    # Before torch 2.11 there is nobody to ask.
+    # Before torch 2.11, get_capabilities does not exist.
     able = getattr(torch.cpu, "get_capabilities", dict)()
     return "bfloat16" if able.get("avx512_bf16") or able.get("amx_bf16") else "float32"
 
 
 def contract(point: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Squeeze all of space into the cube [-2, 2]³, leaving [-1, 1]³ as it is (mip-NeRF 360, with the maximum norm)."""
+    """Contract all of space into [-2, 2]³, leaving [-1, 1]³ unchanged (mip-NeRF 360, with the maximum norm)."""
     size = point.abs().amax(dim=-1, keepdim=True)
     outside = size.clamp_min(1)
     return torch.where(size > 1, (2 - 1 / outside) * (point / outside), point)
@@ -48,11 +48,11 @@ def _harmonics(direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 8"
 
 
 class BroadBrightness(nn.Module):
-    """Log brightness at large: lattices of ``cells``, half as many, ... and 2 cells per side, added up.
+    """Low-frequency log brightness: the sum of lattices with ``cells``, half as many, ... and 2 cells per side.
 
-    An event tells a slope, and a slope across a room is the sum of thousands, each of which wants but its own place
-    to change. Numbers that each reach far give such sums a direction of their own to go in (the multilevel
-    preconditioner of Bramble, Pasciak & Xu 1990); from hash grid and MLP they come last of all.
+    An event constrains a local gradient; a gradient across a room is the sum of thousands, and each loss term only
+    changes its own place. Parameters with large support let the optimizer correct such sums directly (the multilevel
+    preconditioner of Bramble, Pasciak & Xu 1990); hash grid and MLP learn them last.
     """
 
     def __init__(self, cells: int):
@@ -63,7 +63,7 @@ class BroadBrightness(nn.Module):
         self.coarser = nn.ParameterList(nn.Parameter(torch.zeros(1, 1, *[nodes] * 3)) for nodes in coarser)
 
     def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """What is added to the raw intensity at points in the unit cube, which do not move for it."""
+        """Term added to the raw intensity at points in the unit cube; no gradient to the points."""
         side, rows = self.finest.shape.coarsest, self.finest.table
         finest, beyond = rows.split([side**3, len(rows) - side**3])
         total, *finer = *self.coarser, finest.view(1, 1, side, side, side)
@@ -74,11 +74,11 @@ class BroadBrightness(nn.Module):
 
 
 class RadianceField(nn.Module):
-    """Hash grid, a density MLP and an intensity head; where ``broad_cells``, lattices for brightness at large.
+    """Hash grid, density MLP and intensity head; with ``broad_cells``, also lattices for low-frequency brightness.
 
     ``bounded``: the scene lies in [-1, 1]³; else space is contracted. ``intensity_range``: ``unit`` is a sigmoid
-    (the reference implementation's), ``positive`` an exponential, for scenes of any dynamic range. ``precision`` is
-    that of the MLPs' inputs, weights and outputs; their parameters, sums and everything else are float32.
+    (as in the reference implementation), ``positive`` an exponential, for scenes of any dynamic range. ``precision``
+    applies to the MLPs' inputs, weights and outputs; parameters, sums and everything else are float32.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class RadianceField(nn.Module):
         return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     def density_in_unit_cube(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Volume density per unit of length, at points of the grid's own unit cube."""
+        """Volume density per unit length at points in the grid's unit cube."""
         with self._half(point.device):
             raw = torch.cat([self.trunk(chunk)[:, 0] for chunk in _chunks(self.grid(point))])
         return self._activate_density(raw.to(point.dtype))
@@ -120,7 +120,7 @@ class RadianceField(nn.Module):
         self, point: Float[Tensor, "points 3"], direction: Float[Tensor, "points 3"] | None
     ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points"]]:
         """Density and intensity; ``direction`` (unit vectors) is needed only when ``view_dependent``."""
-        # Splitting, unlike slicing, has a gradient that needs no array of zeros for every piece.
+        # Split, do not slice: the gradient of a slice allocates a full array of zeros.
         point = self._unit_cube(point)
         chunks = _chunks(self.grid(point))
         view = [None] * len(chunks)

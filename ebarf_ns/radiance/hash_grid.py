@@ -1,8 +1,8 @@
 """Multi-resolution hash encoding (Müller et al. 2022, Instant Neural Graphics Primitives) with position gradients.
 
-One lattice and one table, and four ways to carry the encoding out: numba kernels on a CPU, Triton kernels on a GPU,
-tiny-cuda-nn where it is importable, and plain torch, which runs anywhere and is what the others are tested against.
-The lattice and the table's order are tiny-cuda-nn's, so that a trained table means the same to all of them.
+One lattice and one table with four backends: numba kernels on a CPU, Triton kernels on a GPU, tiny-cuda-nn if it is
+importable, and plain torch, which runs anywhere and is the reference in tests. The lattice and the table layout are
+those of tiny-cuda-nn, so that a trained table works with every backend.
 """
 
 from __future__ import annotations
@@ -21,51 +21,51 @@ from ebarf_ns.radiance.lattice import PRIMES, HashGridShape, Lattice
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-Carrier = Literal["numba", "triton", "tcnn", "torch"]
+Backend = Literal["numba", "triton", "tcnn", "torch"]
 
 
 class HashGrid(nn.Module):
-    """Features of points in the unit cube, trilinear between the vertices of every level."""
+    """Features of points in the unit cube, interpolated trilinearly on every level."""
 
-    def __init__(self, shape: HashGridShape, carrier: Carrier | None = None):
+    def __init__(self, shape: HashGridShape, backend: Backend | None = None):
         super().__init__()
         self.shape = shape
-        self.carrier: Carrier | None = carrier
+        self.backend: Backend | None = backend
         self.level_shares: Tensor | None = None
-        """Factors of the levels' features; None: all of them as they are."""
+        """Weights of the levels' features; None: all 1."""
         self.lattice = Lattice(shape)
-        # By numpy, which asks for large pages.
+        # Allocated by numpy, which requests huge pages.
         self.table = nn.Parameter(torch.from_numpy(np.empty((sum(shape.rows), shape.features), np.float32)))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
 
     def forward(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
-        """Features of points in [0, 1]³ (points outside are moved to the nearest face)."""
+        """Features of points in [0, 1]³ (points outside are clamped to it)."""
         features = self._encode(point)
         if self.level_shares is None:
             return features
         return features * self.level_shares.repeat_interleave(self.shape.features)
 
     def _encode(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
-        carrier = self.carrier or fastest_carrier(point)
-        if carrier == "numba":
+        backend = self.backend or fastest_backend(point)
+        if backend == "numba":
             from ebarf_ns.radiance.hash_grid_numba import encode
-        elif carrier == "triton":
+        elif backend == "triton":
             from ebarf_ns.radiance.hash_grid_triton import encode
-        elif carrier == "tcnn":
+        elif backend == "tcnn":
             return self._encode_tcnn(point)
         else:
             encode = encode_reference
         return encode(point, self.table, self.lattice)
 
     def _encode_tcnn(self, point: Float[Tensor, "points 3"]) -> Float[Tensor, "points width"]:
-        """Through tiny-cuda-nn's own encoding, with our table in the place of its parameters."""
+        """Encode with tiny-cuda-nn, using our table as its parameters."""
         encoding = _tcnn_encoding(self.shape)
         inside = point.clamp(0, 1) * self.shape.reach
         return torch.func.functional_call(encoding, {"params": self.table.flatten()}, (inside,))
 
 
-def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
-    """What to encode with: by device, precision, and what is importable."""
+def fastest_backend(point: Float[Tensor, "points 3"]) -> Backend:
+    """The fastest backend for a device and precision among those importable."""
     if point.dtype == torch.float32 and point.device.type == "cpu":
         return "numba"
     if point.dtype == torch.float32 and point.is_cuda:
@@ -73,14 +73,14 @@ def fastest_carrier(point: Float[Tensor, "points 3"]) -> Carrier:
             return "tcnn"
         if not why_not("triton"):
             return "triton"
-        _say_slow()
+        _warn_slow()
     return "torch"
 
 
 @lru_cache
 def why_not(name: str) -> str:
-    """Why a library is not made use of, empty where it is: tiny-cuda-nn raises errors of its own on GPUs it was not
-    built for, and Triton's driver is compiled when it is first asked."""
+    """Why a library is not used, empty if it is: tiny-cuda-nn raises its own errors on GPUs it was not built for, and
+    Triton compiles its driver at first use."""
     try:
         module = import_module(name)
         if name == "triton":
@@ -91,10 +91,10 @@ def why_not(name: str) -> str:
 
 
 @lru_cache
-def _say_slow() -> None:
-    """Once: whoever waits should know what for."""
+def _warn_slow() -> None:
+    """Warn once about the slow backend."""
     sys.stderr.write(
-        "the hash grid runs in plain torch on this GPU, about 200 times slower, for want of Triton "
+        "the hash grid runs in plain torch on this GPU, about 200 times slower, without Triton "
         f"({why_not('triton'):.120}) and tiny-cuda-nn ({why_not('tinycudann'):.120})\n"
     )
 
@@ -103,7 +103,7 @@ _encodings: dict[HashGridShape, nn.Module] = {}
 
 
 def _tcnn_encoding(shape: HashGridShape) -> nn.Module:
-    """One for each shape: its own parameters are never used."""
+    """Cached by shape, since the encoding's own parameters are never used."""
     if shape not in _encodings:
         import tinycudann  # pyright: ignore[reportMissingImports]
 
@@ -122,7 +122,7 @@ def _tcnn_encoding(shape: HashGridShape) -> nn.Module:
 def encode_reference(
     point: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], lattice: Lattice
 ) -> Float[Tensor, "points width"]:
-    """The encoding in plain torch, differentiable in table and points, any device and precision."""
+    """The encoding in plain torch, differentiable in table and points, for any device and precision."""
     levels = []
     first_row = lattice.first_row.tolist()
     for level, vertices in enumerate(lattice.resolution.tolist()):

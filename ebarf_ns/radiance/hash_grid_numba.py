@@ -1,4 +1,4 @@
-"""The hash encoding on a CPU: no temporaries per corner, and no atomics, because each thread owns whole levels."""
+"""The hash encoding on a CPU: no temporaries per corner, and no atomics since each thread owns whole levels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,21 +20,21 @@ if TYPE_CHECKING:
 
     from ebarf_ns.radiance.lattice import Lattice
 
-# All of fastmath but the promise that there are no infinities and nothing that is not a number.
+# All fastmath flags except those that assume no infinities and no NaN.
 _FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
 _BLOCK = 128
-# Numbers of a level that a core's own cache holds; larger levels are looked at ahead.
+# Values of a level that fit into a core's private cache; larger levels are prefetched.
 _CACHED = 1 << 17
 _gradients: dict[tuple[int, ...], np.ndarray] = {}
 
 
 def _recycled(shape: tuple[int, ...]) -> Tensor:
-    """Memory for a table's gradient: the last one's where nobody holds it any more, so that no step has to ask for it.
+    """Memory for a table's gradient, reused from the previous step if nothing refers to it any more.
 
-    Memory handed out anew costs more than what is computed in it; numpy also asks for large pages.
+    Fresh memory costs more than the computation; numpy also requests huge pages.
     """
     array = _gradients.get(shape)
-    # Known here by the pool, the name, and the question itself; every tensor in it adds one.
+    # Three references are the pool, the local name and the call argument; every tensor on the array adds one.
     if array is None or sys.getrefcount(array) > 3:
         array = _gradients[shape] = np.empty(shape, np.float32)
     return torch.from_numpy(array)
@@ -61,7 +63,7 @@ class _Encoding(torch.autograd.Function):
     def backward(ctx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         point, table, *levels = ctx.saved_tensors
         table_gradient = _recycled(tuple(table.shape))
-        # Each level writes a plane of its own, so that levels can run in parallel.
+        # Each level writes its own plane, so that levels can run in parallel.
         point_gradient = torch.empty(len(levels[0]), len(point) if ctx.needs_input_grad[0] else 0, 3)
         _, backward = _kernels(table.shape[1])
         tensors = (point, table, *levels, gradients[0].contiguous(), table_gradient, point_gradient)
@@ -72,9 +74,9 @@ class _Encoding(torch.autograd.Function):
 
 @njit(cache=True, inline="always")
 def _cell(coordinate, stretch, vertices):
-    """Cell number along one axis and the place in it; points outside are moved to the face.
+    """Cell index along one axis and the fraction within the cell; points outside are clamped.
 
-    What is not a number is given the last cell, and stays what it is: the features show it.
+    NaN gets the last cell and a NaN fraction, so that it propagates to the features.
     """
     inside = np.float32(0) if coordinate < 0 else np.float32(1) if coordinate > 1 else coordinate
     place = inside * stretch + np.float32(0.5)
@@ -84,7 +86,7 @@ def _cell(coordinate, stretch, vertices):
 
 @njit(cache=True, inline="always")
 def _corner_rows(ix, iy, iz, vertices, rows):
-    """Rows of a cell's eight vertices within the level, x fastest: dense where they all fit, else hashed."""
+    """Rows of a cell's eight vertices within the level, x fastest: dense if the whole level fits, else hashed."""
     if vertices * vertices * vertices <= rows:
         n, nn = np.uint32(vertices), np.uint32(vertices * vertices)
         r = ix + n * iy + nn * iz
@@ -102,15 +104,15 @@ def _corner_rows(ix, iy, iz, vertices, rows):
 
 @njit(cache=True, inline="always")
 def _level(k, levels):
-    """Threads take runs of k: alternate ends, so that each gets cheap coarse and costly fine levels."""
+    """Threads get contiguous k: alternating ends give each thread both cheap coarse and expensive fine levels."""
     return k // 2 if k % 2 == 0 else levels - 1 - k // 2
 
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
 def _touch(point, array, begin, end, scale, vertices, rows):
-    """Look at all rows that a block of points will need.
+    """Prefetch all rows that a block of points will need.
 
-    Looks that depend on nothing wait for memory together; in the midst of arithmetic each waits by itself.
+    Independent loads overlap their memory latency; loads between arithmetic wait one by one.
     """
     total = np.float32(0)
     for i in range(begin, end):
@@ -125,9 +127,9 @@ def _touch(point, array, begin, end, scale, vertices, rows):
 
 @lru_cache
 def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Forward and backward kernels for a number of features a level, which the compiler unrolls.
+    """Forward and backward kernels for a number of features per level, which the compiler unrolls.
 
-    The eight corners are written out: sums then stay in registers, where a loop over them would go through memory.
+    The eight corners are unrolled by hand to keep the sums in registers; a loop would go through memory.
     """
 
     @njit(cache=True, parallel=True, fastmath=_FAST, nogil=True, error_model="numpy")
@@ -135,7 +137,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
         levels, blocks = len(resolution), (len(point) + _BLOCK - 1) // _BLOCK
         touched = np.empty(levels * blocks, np.float32)
         for task in prange(levels * blocks):
-            # All blocks of a level after one another, so that its rows stay in cache.
+            # Process all blocks of a level in succession, so that its rows stay in cache.
             level, block = _level(task // blocks, levels), task % blocks
             begin, end = block * _BLOCK, min(len(point), (block + 1) * _BLOCK)
             vertices, scale = resolution[level], stretch[level]
@@ -205,7 +207,7 @@ def _kernels(features: int) -> tuple[Callable[..., None], Callable[..., None]]:
                         along_x = scale * (gy * (b1 - b0) + fy * (b3 - b2))
                         along_y = scale * (gx * (b2 - b0) + fx * (b3 - b1))
                         along_z = scale * (w00 * (a4 - a0) + w10 * (a5 - a1) + w01 * (a6 - a2) + w11 * (a7 - a3))
-                        # Whoever was moved to a face feels nothing across it.
+                        # Clamped coordinates have no gradient.
                         point_gradient[level, i, 0] = along_x if 0 <= point[i, 0] <= 1 else np.float32(0)
                         point_gradient[level, i, 1] = along_y if 0 <= point[i, 1] <= 1 else np.float32(0)
                         point_gradient[level, i, 2] = along_z if 0 <= point[i, 2] <= 1 else np.float32(0)

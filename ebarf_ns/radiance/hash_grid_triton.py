@@ -1,14 +1,14 @@
-"""The hash encoding on a GPU: one program a block of points, which walks the levels and keeps its sums in registers.
+"""The hash encoding on a GPU: one program per block of points, which loops over levels with its sums in registers.
 
-Triton comes with torch and compiles at first use, its launcher by the system's C compiler; nothing has to be built
-beforehand. With ``TRITON_INTERPRET=1`` set before the import, the same kernels run on a CPU, slowly: that is how
-machines without a GPU test them.
+Triton comes with torch and compiles at first use, its launcher with the system's C compiler; nothing has to be built
+beforehand. With ``TRITON_INTERPRET=1`` set before the import, the same kernels run slowly on a CPU, for tests without a
+GPU.
 """
 
 # Triton's language is not Python to a type checker.
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false
 
-# No postponed annotations: Triton 3.0's interpreter looks for tl.constexpr itself.
+# No postponed annotations: Triton 3.0's interpreter needs tl.constexpr itself, not a string.
 from typing import TYPE_CHECKING
 
 import torch
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from ebarf_ns.radiance.lattice import Lattice
 
-_BLOCK = 128  # points a program
+_BLOCK = 128  # points per program
 
 
 def encode(
@@ -50,7 +50,7 @@ class _Encoding(torch.autograd.Function):
     def backward(ctx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         point, table, *levels = ctx.saved_tensors
         count, features = len(point), table.shape[1]
-        # Programs add to the table in no order: here alone, zeros have to be there first.
+        # Programs accumulate into the table atomically, so that only this array must start at zero.
         table_gradient, point_gradient = torch.zeros_like(table), torch.empty_like(point)
         if count:
             grid = (triton.cdiv(count, _BLOCK),)
@@ -62,7 +62,7 @@ class _Encoding(torch.autograd.Function):
 
 @triton.jit
 def _cell(coordinate, stretch, vertices):
-    """As in the numba kernels: what is not a number is given the last cell, and stays what it is."""
+    """As in the numba kernels: NaN gets the last cell and a NaN fraction."""
     inside = tl.where(coordinate < 0, 0.0, tl.where(coordinate > 1, 1.0, coordinate))
     place = inside * stretch + 0.5
     known = place < (vertices - 1).to(tl.float32)
@@ -72,10 +72,10 @@ def _cell(coordinate, stretch, vertices):
 
 @triton.jit
 def _row(ix, iy, iz, vertices, rows):
-    """Row of a vertex within its level: dense where all vertices fit, else hashed, in 32 bits that wrap around."""
+    """Row of a vertex within its level: dense if all vertices fit, else hashed, in wrapping 32-bit arithmetic."""
     n = vertices.to(tl.int32)
     dense = ix + n * (iy + n * iz)
-    # 2654435761 as a signed number.
+    # 2654435761 as a signed 32-bit integer.
     hashed = (ix ^ (iy * -1640531535) ^ (iz * 805459861)) & (rows - 1).to(tl.int32)
     return tl.where(vertices * vertices * vertices <= rows, dense, hashed).to(tl.int64)
 
@@ -139,7 +139,7 @@ def _backward(
             gx += scale * along * wy * wz * (1.0 if ox else -1.0)
             gy += scale * along * wx * wz * (1.0 if oy else -1.0)
             gz += scale * along * wx * wy * (1.0 if oz else -1.0)
-    # Whoever was moved to a face feels nothing across it.
+    # Clamped coordinates have no gradient.
     tl.store(point_gradient + 3 * i, tl.where((x >= 0) & (x <= 1), gx, 0.0), here)
     tl.store(point_gradient + 3 * i + 1, tl.where((y >= 0) & (y <= 1), gy, 0.0), here)
     tl.store(point_gradient + 3 * i + 2, tl.where((z >= 0) & (z <= 1), gz, 0.0), here)

@@ -17,7 +17,7 @@ PRIMES = (1, 2654435761, 805459861)
 
 @dataclass(frozen=True)
 class HashGridShape:
-    """Levels of geometrically growing resolution; a level that fits ``table_size`` is stored densely, else hashed."""
+    """Levels of geometrically growing resolution; a level that fits the table size is stored densely, else hashed."""
 
     levels: int = 8
     features: int = 4
@@ -27,12 +27,12 @@ class HashGridShape:
 
     @property
     def growth(self) -> float:
-        """Ratio of neighbouring resolutions; a hair less than asked, so that rounding cannot add a vertex."""
+        """Ratio of successive resolutions, slightly reduced so that rounding cannot add a vertex."""
         return ((self.finest - 0.1) / self.coarsest) ** (1 / max(self.levels - 1, 1))
 
     @property
     def scales(self) -> list[float]:
-        """Cells of each level between its first and last vertex."""
+        """Number of cells of each level between its first and last vertex."""
         return [self.coarsest * self.growth**level - 1 for level in range(self.levels)]
 
     @property
@@ -52,12 +52,12 @@ class HashGridShape:
 
     @property
     def reach(self) -> float:
-        """Share of tiny-cuda-nn's cube in which every cell has both its vertices: [0, 1] is mapped to [0, reach]."""
+        """Share of tiny-cuda-nn's cube in which every cell has both vertices: [0, 1] is mapped to [0, reach]."""
         return (self.coarsest - 1.5) / (self.coarsest - 1)
 
 
 class Lattice(nn.Module):
-    """What the kernels need to know of the levels, as tensors that move with the module."""
+    """Level parameters for the kernels, as tensors that move with the module."""
 
     def __init__(self, shape: HashGridShape):
         super().__init__()
@@ -65,8 +65,8 @@ class Lattice(nn.Module):
         self.register_buffer("resolution", torch.tensor(shape.resolutions), persistent=False)
         self.register_buffer("first_row", torch.tensor([0, *np.cumsum(shape.rows)]), persistent=False)
         self.stretch: Tensor
-        """Cells of each level across the unit cube, float32 of the levels."""
+        """Cells of each level across the unit cube, float32 (levels,)."""
         self.resolution: Tensor
-        """Vertices per side, int64 of the levels."""
+        """Vertices per side, int64 (levels,)."""
         self.first_row: Tensor
-        """Where each level begins in the table, int64 of the levels and one more."""
+        """First table row of each level, int64 (levels + 1,)."""

@@ -1,4 +1,4 @@
-"""Importance sampling on a CPU in one pass: each ray walks the remembered density and places its samples."""
+"""Importance sampling on a CPU in one pass: each ray marches through the cached density and places its samples."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.radiance.hash_grid_numba import _FAST
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def importance_edges(
     jitter: Float[Tensor, "rays 1"],
     pairs: bool,
 ) -> Float[Tensor, "rays samples+1"]:
-    """What :func:`ebarf_ns.radiance.ray_sampling.importance_edges` computes, for float32 on a CPU."""
+    """:func:`ebarf_ns.radiance.ray_sampling.importance_edges` for float32 on a CPU."""
     edges = torch.empty(len(far), samples + 1)
     sharing = 2 if pairs else 1
     columns = (rays.origin.contiguous(), rays.direction.contiguous(), far, jitter[:, 0], grid.density)
@@ -45,7 +46,7 @@ def importance_edges(
 
 @njit(cache=True, inline="always")
 def _along(coordinate, half_side, cells):
-    """Cell number along one axis; what is not a number goes to the first, as what lies below does."""
+    """Cell index along one axis; NaN goes to the first cell, like coordinates below it."""
     place = (coordinate + np.float32(half_side)) * np.float32(cells / (2 * half_side))
     if place > 0:
         return np.int64(place) if place < cells else np.int64(cells - 1)
@@ -54,7 +55,7 @@ def _along(coordinate, half_side, cells):
 
 @njit(cache=True, inline="always")
 def _cell(x, y, z, half_side, cells):
-    """Number of the cell that holds a point; all of space is contracted where the grid reaches beyond 1."""
+    """Index of the cell that contains a point; space is contracted if the grid reaches beyond 1."""
     if half_side > 1:
         size = max(abs(x), abs(y), abs(z))
         if size > 1:
@@ -93,7 +94,7 @@ def _place(
         seen = np.float32(0)
         for i in range(coarse):
             seen += weights[i + 1]
-        # What passes through the scene is spread evenly too.
+        # Light from the background is spread evenly too.
         spread = (uniform_share + max(1 - seen, np.float32(0))) / coarse
         total = seen + spread * coarse
         for i in range(coarse):
@@ -110,7 +111,7 @@ def _place(
                 upper = near + (i + 1) * step if half_side == 1 else lower * ratio
             share = (wanted - weights[i]) / max(weights[i + 1] - weights[i], np.float32(1e-12))
             first[j] = lower + min(max(share, np.float32(0)), np.float32(1)) * (upper - lower)
-        # One by one: to assign a row brings a check of its shape, whose message takes seconds to compile.
+        # Copy element by element: assigning a row adds a shape check whose message takes seconds to compile.
         for k in range(1, sharing):
             for j in range(samples + 1):
                 edges[group + k * groups, j] = first[j]

@@ -1,4 +1,4 @@
-"""From rays to what they see: where to ask the field, and the sum of its answers."""
+"""The renderer: sample placement along rays and volume rendering of the field."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ebarf_ns.radiance.ray_sampling import (
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Without bounds, 400 times the trajectory's radius; beyond it contracted space is a hundredth of a cell thick.
+# For unbounded scenes, 400 times the trajectory's radius; the contracted space beyond is 1/100 of a cell thick.
 _FAR_UNBOUNDED = 100.0
 _BACKGROUND = 0.5
 _WARM_UP, _REFRESH_EVERY = 16, 8
@@ -32,28 +32,28 @@ _WARM_UP, _REFRESH_EVERY = 16, 8
 
 @dataclass(frozen=True)
 class Sampling:
-    """Where along a ray the field is asked."""
+    """Placement of samples along rays."""
 
     samples: int = 24
-    """Points per ray at which the field is asked."""
+    """Field evaluations per ray."""
     near: float = 0.05
     """Distance at which rays begin."""
     kind: Literal["importance", "uniform"] = "importance"
-    """Where the remembered density is, or everywhere evenly."""
+    """By cached density, or evenly."""
     coarse_samples: int = 128
-    """Points per ray at which the remembered density is looked up."""
+    """Lookups of the cached density per ray."""
     uniform_share: float = 0.125
-    """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
+    """Share of the importance samples that is spread evenly, so that no region is missed."""
     most_hidden: float = 0.15
-    """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
+    """Largest share of what is behind it that an interval may occlude in sample placement; 1: all of it."""
     density_cells: int = 96
-    """Cells per side of the remembered density."""
+    """Cells per side of the density cache."""
 
 
 class Renderer(nn.Module):
-    """A field, and with importance sampling a memory of where it is dense, so that empty space costs little.
+    """A field and, for importance sampling, a density cache that makes empty space cheap.
 
-    A bounded scene lies in the box [-h, h], h the ``half_sides``.
+    A bounded scene lies in the box [-h, h] with h = ``half_sides``.
     """
 
     def __init__(self, field: RadianceField, sampling: Sampling, half_sides: Float[Tensor, "3"] | None = None):
@@ -66,22 +66,21 @@ class Renderer(nn.Module):
         )
 
     def begin_step(self, step: int, random: torch.Generator) -> None:
-        """Keep the memory up with the field: often at first, then every so many steps."""
+        """Refresh the density cache: in every step at first, then every few steps."""
         if self.density_grid and (step < _WARM_UP or step % _REFRESH_EVERY == 0):
             self.density_grid.refresh(self.field, step if step < _WARM_UP else step // _REFRESH_EVERY, random)
 
     def forward(self, rays: Rays, pairs_random: torch.Generator | None = None) -> Rendered:
-        """What each ray sees; with ``pairs_random``, jittered, and ray k shares its samples with ray k + n/2.
+        """Render rays; with ``pairs_random``, samples are jittered, and rays k and k + n/2 share them.
 
-        The loss looks at the difference between the two rays of a pair: whatever differs between them but the pose is
-        noise in exactly that.
+        The loss uses the difference between the two rays of a pair: any other difference than the pose is noise in it.
         """
         edges = self.sample_edges(rays, pairs_random)
         return composite(self.field, rays, edges, _BACKGROUND, self.density_grid if pairs_random else None)
 
     @torch.no_grad()
     def sample_edges(self, rays: Rays, pairs_random: torch.Generator | None) -> Float[Tensor, "rays samples+1"]:
-        """Edges of the intervals whose middles are asked for."""
+        """Edges of the intervals whose midpoints are sampled."""
         sampling, bounded = self.sampling, self.field.bounded
         far = leave_box(rays, self.half_sides) if bounded else torch.full_like(rays.origin[:, 0], _FAR_UNBOUNDED)
         jitter = torch.zeros(len(far), 1, device=far.device)

@@ -1,1 +1,1 @@
-"""The project's own event camera, for tests and demos."""
+"""Event camera simulator for tests and demos."""

@@ -1,4 +1,4 @@
-"""Scenes by name: what there is to see, and how the camera moves."""
+"""Scenes by name: surroundings and camera motion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ SceneName = Literal["handheld-room", "slide", "orbit", "hdr-window", "fast-rotat
 
 @dataclass(frozen=True)
 class Place:
-    """A room, a motion through it, and where in it a mesh would stand."""
+    """A room, a camera motion in it, and the position of an optional mesh."""
 
     room: Room
     motion: Motion
@@ -24,7 +24,7 @@ def _handheld_room(seed: int) -> Place:
 
 
 def _slide(seed: int) -> Place:
-    """Forward-facing and along one line, without any rotation: no place to hide for depth."""
+    """Forward-facing translation along a line without rotation, so that depth errors show."""
     motion = HandheldMotion(sway_m=(0.0, 0.6, 0.0), turn_rad=0.0, seed=seed)
     return Place(Room(seed=seed), motion)
 

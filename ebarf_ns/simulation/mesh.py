@@ -1,4 +1,4 @@
-"""A textured mesh from a file, standing in a room."""
+"""A textured mesh from a file, placed in a room."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +17,7 @@ _BLACK = 0.02
 
 @dataclass(frozen=True)
 class RoomWithMesh:
-    """A mesh of any format that Open3D reads, scaled to ``size_m``, its middle put at ``middle``."""
+    """A mesh of any format that Open3D reads, scaled to ``size_m`` and centred at ``middle``."""
 
     room: Room
     path: Path
@@ -41,13 +41,13 @@ class RoomWithMesh:
         return radiance, distance
 
     def _reflected(self, triangle: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Linear grey, from the vertices' colours or the texture."""
+        """Linear grey value from the vertex colours or the texture."""
         corners, texture = self._colours
         value = np.einsum("nk,nkc->nc", share, corners[triangle])
         if texture is None:
             return value[:, 0]
         height, width = texture.shape
-        # Texture coordinates repeat, and begin at the lower left.
+        # Texture coordinates wrap around, with the origin at the lower left.
         x, y = (value % 1).T
         return map_coordinates(texture, [(1 - y) * (height - 1), x * (width - 1)], order=1)
 
@@ -75,7 +75,7 @@ class RoomWithMesh:
                 mesh = t.io.read_triangle_mesh(str(self.path))
             triangles = len(mesh.triangle.indices)
         except (IndexError, KeyError):
-            # So Open3D ends where a file has not what a mesh consists of.
+            # Open3D raises these for files without triangles or vertices.
             triangles = 0
         if not triangles:
             raise SimulationError(f"{self.path}: holds no triangles, expected a mesh of a format that Open3D reads")
@@ -83,7 +83,7 @@ class RoomWithMesh:
 
     @cached_property
     def _colours(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """Grey of each corner of each triangle and no texture, or texture coordinates and the texture."""
+        """Grey value per triangle corner and None, or texture coordinates per corner and the texture."""
         mesh = self._mesh
         if "texture_uvs" in mesh.triangle and "albedo" in mesh.material.texture_maps:
             return mesh.triangle.texture_uvs.numpy(), _linear(mesh.material.texture_maps["albedo"].as_tensor().numpy())

@@ -1,4 +1,4 @@
-"""Smooth camera motions with six degrees of freedom, exact at every instant."""
+"""Smooth six-degree-of-freedom camera motions, defined at every time."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,7 +12,7 @@ from ebarf_ns.geometry.trajectory import Poses, Trajectory
 
 
 class Motion(Protocol):
-    """Where a camera is at any time, in metres and microseconds."""
+    """Camera pose as a function of time, in metres and microseconds."""
 
     def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
         """Camera centres [m]."""
@@ -25,7 +25,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class HandheldMotion:
-    """A camera swayed about a place by hand: a few sinusoids of random frequency and phase on each axis."""
+    """A handheld camera swaying about a place: a few sinusoids of random frequency and phase on each axis."""
 
     place: tuple[float, float, float] = (-1.0, 0.0, 0.4)
     look_at: tuple[float, float, float] = (1.5, 0.0, -0.1)
@@ -50,7 +50,7 @@ class HandheldMotion:
 
 @dataclass(frozen=True)
 class OrbitMotion:
-    """A camera carried around a centre that it keeps in view, with some sway of the hand that carries it."""
+    """A camera carried around a centre that it keeps in view, with some hand sway."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, -0.5)
     radius_m: float = 1.5
@@ -79,7 +79,7 @@ class OrbitMotion:
 
 @dataclass(frozen=True)
 class Faster:
-    """Another motion, played at another speed."""
+    """Another motion at a different speed."""
 
     motion: Motion
     speed: float
@@ -96,7 +96,7 @@ class Faster:
 def _sway(
     t_us: np.ndarray, seed: int, first_axis: int, frequency_hz: tuple[float, float] = (0.2, 0.7), tones: int = 3
 ) -> np.ndarray:
-    """Three numbers of about unit variance that wander smoothly with time."""
+    """Three smooth random functions of time with about unit variance."""
     random = np.random.default_rng([seed, first_axis])
     frequency = random.uniform(*frequency_hz, (tones, 3))
     phase = random.uniform(0, 2 * np.pi, (tones, 3))
@@ -105,7 +105,7 @@ def _sway(
 
 
 def _looking(forward: np.ndarray) -> np.ndarray:
-    """Level cameras (x right, y down, world z up) that look along ``forward``, one direction or many."""
+    """Rotations of level cameras (x right, y down, world z up) that look along one or many directions ``forward``."""
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
@@ -113,7 +113,7 @@ def _looking(forward: np.ndarray) -> np.ndarray:
 
 
 def sample_trajectory(motion: Motion, t_us: Int64[np.ndarray, "times"]) -> Trajectory:
-    """The true poses at given times, float64."""
+    """True poses at given times, float64."""
     quat_xyzw = torch.from_numpy(Rotation.from_matrix(motion.rotation(t_us)).as_quat())
     return Trajectory(
         torch.from_numpy(t_us), Poses(torch.from_numpy(motion.position(t_us)), quat_xyzw[:, [3, 0, 1, 2]])

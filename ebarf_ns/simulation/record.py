@@ -1,4 +1,4 @@
-"""A view's events: rendered where and when something changes, so that no event is missed or late."""
+"""Events of a view, rendered adaptively where and when brightness changes, so that none is missed or late."""
 
 from collections.abc import Callable
 
@@ -21,12 +21,12 @@ _SHARPENINGS, _SHARP_US = 12, 0.02
 def record(
     view: View, model: SensorModel, end_us: int, seed: int, progress: Callable[[float], None] = lambda fraction: None
 ) -> Recording:
-    """What an event camera reports from time 0 to ``end_us``.
+    """Simulate an event camera from time 0 to ``end_us``.
 
-    Between two renders nothing moves further than a third of a pixel, and between two samples of a pixel its log
-    brightness changes by no more than a third of a threshold, but for jumps, which are found to a microsecond. Peaks
-    are sampled too. Then the time of each event is solved for, but for pixels of limited bandwidth or with a refractory
-    period, where it is interpolated between those samples.
+    Between two renders, nothing moves more than a third of a pixel; between two samples of a pixel, its log brightness
+    changes by at most a third of a threshold, except for jumps, which are located to a microsecond. Peaks are sampled
+    too. Event times are then solved for; for pixels with limited bandwidth or a refractory period, they are
+    interpolated between those samples.
     """
     steps = _Steps(view, model, end_us)
     radiance, distance = view.images(np.zeros(1))
@@ -39,7 +39,7 @@ def record(
             following_us = steps.following(float(t_us[-1]), distance[-1])
             radiance, distance = view.images(following_us)
             t_us, brightness = np.r_[t_us, following_us], np.concatenate([brightness, np.log(radiance)])
-        # A peak shows only when what comes after it is known, and what came before.
+        # A peak is only detected once the samples before and after it are known.
         until = len(t_us) - (1 if t_us[-1] == end_us else 2)
         if until > seen:
             crossings = sensor.see(*_samples(view, t_us, brightness, seen, until, largest_change))
@@ -56,26 +56,26 @@ def record(
 
 
 class _Steps:
-    """When to render, some times at once."""
+    """Adaptive render times, several at once."""
 
     def __init__(self, view: View, model: SensorModel, end_us: int):
         self._view, self._end_us = view, float(end_us)
         self._longest_us = 1e6 / (2 * np.pi * model.widest_hz) / _STEPS_PER_LAG if model.cutoff_hz else _LONGEST_US
         rays = view.camera.width * view.camera.height * view.rays_per_pixel
         self._at_once = int(np.clip(_RAYS_AT_ONCE // rays, 1, _MOST_AT_ONCE))
-        # Over so few steps things come no nearer than this share of their distance.
+        # Lower bound of a distance after these few steps, relative to the distance now.
         few_rad = self._at_once * _PIXELS_PER_STEP / view.pixels_per_rad.min()
         self._nearer = max(0.5, 1 - 2 * few_rad)
-        # What happens within a millisecond is not the hand's doing.
+        # Hand motion is constant within a millisecond.
         self._velocity, self._turn = view.velocities(np.arange(0.0, end_us + 1000, 1000))
 
     def following(self, t_us: float, distance: Float[np.ndarray, "pixels"]) -> Float[np.ndarray, "times"]:
-        """The next times after this one, at which the things in view are at these distances."""
+        """The next render times after ``t_us``, at which the scene is at ``distance``."""
         times = [t_us]
         distance = self._nearer * distance
         while len(times) <= self._at_once and times[-1] < self._end_us:
             step_us = self._step_us(times[-1], distance)
-            # The camera may be faster when the step ends.
+            # The camera may be faster at the end of the step.
             step_us = min(step_us, self._step_us(times[-1] + step_us, distance))
             times.append(min(times[-1] + max(step_us, _FINEST_US), self._end_us))
         return np.array(times[1:])
@@ -94,9 +94,9 @@ def _samples(
     until: int,
     largest_change: float,
 ) -> tuple[Int64[np.ndarray, "samples"], Float[np.ndarray, "samples"], Float[np.ndarray, "samples"]]:
-    """Pixel, time and log brightness after time ``seen`` up to time ``until``, in order.
+    """Pixel, time and log brightness after index ``seen`` up to index ``until`` of the times, sorted by pixel and time.
 
-    At the times themselves, at peaks, and in between by halves wherever the change is too large.
+    Samples are at the times themselves, at peaks, and at bisections of intervals with too large a change.
     """
     steps, count = until - seen, brightness.shape[1]
     pixel = np.repeat(np.arange(count), steps)
@@ -118,7 +118,7 @@ def _samples(
         first[3:], second[1:3] = (middle_us, middle), (middle_us, middle)
         parts = np.concatenate([first, second], axis=1)
     pixel, at_us, log_brightness = (np.concatenate(columns) for columns in zip(*samples, strict=True))
-    # As good as sorted already; a microsecond here is a ten-millionth of that between two pixels.
+    # Sort by pixel, then time, scaled to below 1; the data are nearly sorted, which a stable sort exploits.
     order = np.argsort(pixel + (at_us - t_us[seen]) / (t_us[until] - t_us[seen] + 1), kind="stable")
     return pixel[order], at_us[order], log_brightness[order]
 
@@ -126,7 +126,7 @@ def _samples(
 def _peaks(
     t_us: Float[np.ndarray, "times"], brightness: Float[np.ndarray, "times pixels"]
 ) -> tuple[Int64[np.ndarray, "peaks"], Float[np.ndarray, "peaks"]]:
-    """Pixel and time of highest and lowest points, each that of the parabola through three samples around it."""
+    """Pixel and time of extrema, from the parabola through the three samples around each."""
     slope = np.diff(brightness, axis=0) / np.diff(t_us)[:, None]
     row, pixel = np.nonzero(slope[:-1] * slope[1:] < 0)
     middle_us = (t_us[1:] + t_us[:-1]) / 2
@@ -135,11 +135,11 @@ def _peaks(
 
 
 def _sharpened(view: View, sensor: EventSensor, crossings: Crossings) -> Float[np.ndarray, "events"]:
-    """Times at which the view itself crosses the levels, by the Illinois method between the samples around each."""
+    """Exact times at which the view crosses the levels, by the Illinois method between the samples around each."""
     t_us = crossings.t_us.copy()
     below_us, below = crossings.before_us.copy(), crossings.before - crossings.level
     above_us, above = crossings.after_us.copy(), crossings.after - crossings.level
-    # A threshold that shrinks passes a level that nothing else does.
+    # A shrinking threshold can cause a crossing without a sign change, which has no root to find.
     (some,) = np.nonzero((above_us - below_us > _FINEST_US) & (np.sign(below) != np.sign(above)))
     for _ in range(_SHARPENINGS):
         if not len(some):

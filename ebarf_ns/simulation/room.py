@@ -1,14 +1,16 @@
-"""An analytic scene: a textured room with a few boxes and balls in it, seen by exact ray casting.
+"""An analytic scene: a textured room with a few boxes and balls, rendered by exact ray casting.
 
-Surfaces are diffuse; their radiance is a smooth, band-limited pattern of position, so that it is defined everywhere
-without texture files and has no detail finer than a few centimetres.
+Surfaces are diffuse; their radiance is a smooth, band-limited function of position, which needs no texture files and
+has no detail finer than a few centimetres.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import prange
+
+from ebarf_ns.compiled import njit
 
 _TINY = 1e-200
 
@@ -24,19 +26,19 @@ class Room:
         (1.2, 0.5, -1.0, 1.8, 1.2, 0.4),
         (0.6, 0.2, -1.0, 1.0, 0.6, -0.5),
     )
-    """Lower then upper corner of each."""
+    """Lower, then upper corner of each."""
     balls: tuple[tuple[float, ...], ...] = ((1.0, -0.6, 0.15, 0.25), (0.8, 0.4, -0.25, 0.25), (1.5, -1.4, -0.6, 0.4))
     """Centre and radius of each."""
     wavelength: float = 0.55
-    """Coarsest detail of the pattern; the finest is a quarter of it."""
+    """Coarsest wavelength of the pattern; the finest is a quarter of it."""
     log_contrast: float = 1.1
     """Amplitude of the pattern in log radiance."""
     face_contrast: float = 0.35
-    """Largest difference in log radiance of a whole face from the mean, so that edges show everywhere."""
+    """Largest offset of a whole face in log radiance from the mean, so that edges between faces are visible."""
     window: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Lowest y and z, then highest, of a window in the wall of highest x; nothing where it has no area."""
+    """Lowest y and z, then highest, of a window in the wall of highest x; none if it has no area."""
     daylight: float = 1000.0
-    """How many times brighter than indoors it is behind the window."""
+    """Radiance behind the window relative to indoors."""
     seed: int = 0
 
     def cast(
@@ -59,7 +61,7 @@ def _cast(origin, direction, walls, boxes, balls, window, wavelength, log_contra
     for i in prange(count):
         o = (origin[i, 0], origin[i, 1], origin[i, 2])
         d = (direction[i, 0], direction[i, 1], direction[i, 2])
-        # Divided once; of a ray along a face, by what is as good as nothing.
+        # Divided once per ray; rays parallel to a face divide by a tiny number instead of 0.
         slow = (1 / (d[0] or _TINY), 1 / (d[1] or _TINY), 1 / (d[2] or _TINY))
         nearest, normal_axis, surface = _leave_box(o, slow, walls)
         for b in range(len(boxes)):
@@ -140,12 +142,12 @@ def _pattern(x, y, z, normal_axis, seed, wavelength):
 
 @njit(cache=True)
 def _value_noise(x, y, z, seed):
-    """Random values in [-1, 1] on the integer lattice, joined smoothly (quintic fade)."""
+    """Random values in [-1, 1] on the integer lattice, interpolated smoothly (quintic fade)."""
     cx, cy, cz = np.floor(x), np.floor(y), np.floor(z)
     fx, fy, fz = _fade(x - cx), _fade(y - cy), _fade(z - cz)
     ix, iy, iz = int(cx), int(cy), int(cz)
     value = 0.0
-    # A coordinate on the lattice, as a face has one, needs no second corner.
+    # A coordinate on the lattice, as on every face, needs no second corner.
     for dx in range(2 if fx > 0 else 1):
         wx = fx if dx else 1 - fx
         for dy in range(2 if fy > 0 else 1):
@@ -163,7 +165,7 @@ def _fade(u):
 
 @njit(cache=True)
 def _hash(x, y, z, seed):
-    """A value in [-1, 1] that looks random, from three integers and a seed."""
+    """Pseudorandom value in [-1, 1] from three integers and a seed."""
     h = np.uint32(x) * np.uint32(374761393) + np.uint32(y) * np.uint32(668265263)
     h = np.uint32(h) + np.uint32(z) * np.uint32(2147483647) + np.uint32(seed) * np.uint32(1274126177)
     h = np.uint32(h)

@@ -1,7 +1,7 @@
-"""The event sensor: log brightness in, threshold crossings out (Eq. 1), as cleanly or as badly as asked for.
+"""The event sensor: log brightness in, threshold crossings out (Eq. 1), with configurable imperfections.
 
-The imperfections are those that v2e (Hu, Liu, Delbruck 2021) describes. Deblur e-NeRF (Low & Lee 2024) models the
-bandwidth that follows the light in more detail.
+The imperfections are those described by v2e (Hu, Liu, Delbruck 2021). Deblur e-NeRF (Low & Lee 2024) models the
+intensity-dependent bandwidth in more detail.
 """
 
 from dataclasses import dataclass
@@ -9,37 +9,38 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
-from numba import njit
+
+from ebarf_ns.compiled import njit
 
 _NARROWEST, _WIDEST = 0.1, 3.0
-"""Bounds of a bandwidth that follows the light, over ``cutoff_hz``."""
+"""Bounds of the intensity-dependent bandwidth, relative to ``cutoff_hz``."""
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """What a pixel does; the defaults are a perfect sensor."""
+    """Pixel parameters; the defaults are an ideal sensor."""
 
     threshold_on: float = 0.25
-    """Rise of log brightness that an event reports."""
+    """Contrast threshold of ON events, in log brightness."""
     threshold_off: float = 0.25
     threshold_mismatch: float = 0.0
-    """Standard deviation of the pixels' thresholds over their mean, for each polarity on its own."""
+    """Standard deviation of the pixels' thresholds relative to their mean, independent per polarity."""
     threshold_drift: float = 0.0
-    """By how much thresholds grow from the first to the last moment, over their mean."""
+    """Growth of the thresholds from start to end, relative to their mean."""
     refractory_us: float = 0.0
-    """After an event, a pixel is blind this long, and then compares with what it sees at the end of it."""
+    """Time for which a pixel is blind after an event; at its end, the current brightness becomes the reference."""
     cutoff_hz: float = 0.0
-    """Bandwidth of the pixels, a low pass of first order on log brightness; 0: unlimited."""
+    """Bandwidth of the pixels, a first-order low-pass filter on log brightness; 0: unlimited."""
     cutoff_reference: float = 0.0
-    """Linear intensity at which the bandwidth is ``cutoff_hz``; it then follows the light,
-    cutoff_hz * clip(intensity / cutoff_reference, 0.1, 3); 0: the same at any light."""
+    """Linear intensity at which the bandwidth is ``cutoff_hz``; the bandwidth is then
+    cutoff_hz * clip(intensity / cutoff_reference, 0.1, 3); 0: independent of intensity."""
     shot_noise_hz: float = 0.0
-    """Events of either polarity out of nothing, a pixel."""
+    """Rate of noise events of random polarity per pixel."""
     leak_hz: float = 0.0
-    """Positive events of a pixel that sees nothing change, a pixel."""
+    """Rate of positive leak events per pixel at constant brightness."""
     hot_pixels: int = 0
     hot_pixel_hz: float = 2000.0
-    """Events of either polarity out of nothing of each hot pixel."""
+    """Rate of noise events of random polarity per hot pixel."""
     jitter_us: float = 0.0
     """Standard deviation of the timestamps."""
 
@@ -50,7 +51,7 @@ class SensorModel:
 
 
 class Crossings(NamedTuple):
-    """Events of some time, with the samples between which each crossed its level; noise has no such samples."""
+    """Events with the samples between which each crossed its level; noise events have NaN samples."""
 
     pixel: Int64[np.ndarray, "events"]
     t_us: Float[np.ndarray, "events"]
@@ -63,10 +64,9 @@ class Crossings(NamedTuple):
 
 
 class EventSensor:
-    """Compares each pixel's log brightness with ``level``, that at its last event.
+    """Compares each pixel's log brightness with ``level``, its value at the last event.
 
-    Between two samples of a pixel its log brightness is taken as linear in time, and its bandwidth as that of the light
-    halfway.
+    Between two samples of a pixel, log brightness is assumed linear in time, and the bandwidth is that at the midpoint.
     """
 
     def __init__(self, model: SensorModel, end_us: float, seed: int, log_brightness: Float[np.ndarray, "pixels"]):
@@ -79,9 +79,9 @@ class EventSensor:
         self.threshold_on, self.threshold_off = model.threshold_on * mismatch[0], model.threshold_off * mismatch[1]
         self._noise_hz = np.full(count, model.shot_noise_hz)
         self._noise_hz[self._random.permutation(count)[: model.hot_pixels]] += model.hot_pixel_hz
-        # Every sample is kept as (time, what comes in, what the low pass lets through).
+        # The last sample of each pixel: time, input and low-pass output.
         self._t_us, self._input, self._output = np.zeros(count), log_brightness.copy(), log_brightness.copy()
-        # Switched on long ago: levels lie anywhere within a threshold of the brightness, in the same way for all seeds.
+        # A sensor switched on long ago: levels are spread within a threshold of the brightness, equally for all seeds.
         phase = np.random.default_rng(0).uniform(-1, 1, count)
         self.level = log_brightness + phase * self._growth(0) * np.where(
             phase > 0, self.threshold_off, self.threshold_on
@@ -89,7 +89,7 @@ class EventSensor:
         self._blind_until_us = np.full(count, -np.inf)
 
     def leak(self, t_us: Float[np.ndarray, "samples"]) -> Float[np.ndarray, "samples"]:
-        """What leaks into the comparison by a time, in log brightness."""
+        """Accumulated leak at a time, in log brightness."""
         return self._leak_per_us * t_us
 
     def see(
@@ -98,7 +98,7 @@ class EventSensor:
         t_us: Float[np.ndarray, "samples"],
         log_brightness: Float[np.ndarray, "samples"],
     ) -> Crossings:
-        """The events up to new samples, which are in order of pixel, then time; ordered likewise."""
+        """Process new samples, sorted by pixel, then time; returns their events in the same order."""
         until_us = float(t_us.max())
         noise_pixel, noise_us, noise_polarity = self._noise(float(self._t_us.min()), until_us)
         growth = self._growth(until_us)
@@ -116,13 +116,13 @@ class EventSensor:
         return 1 + self.model.threshold_drift * (t_us / self.end_us - 0.5)
 
     def jitter(self, t_us: Float[np.ndarray, "events"]) -> Int64[np.ndarray, "events"]:
-        """Timestamps as the sensor gives them."""
+        """Integer timestamps with jitter."""
         if self.model.jitter_us:
             t_us = t_us + self.model.jitter_us * self._random.standard_normal(len(t_us))
         return np.clip(np.rint(t_us), 0, self.end_us).astype(np.int64)
 
     def _noise(self, since_us: float, until_us: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Events out of nothing, in order of pixel, then time."""
+        """Noise events, sorted by pixel, then time."""
         counts = self._random.poisson(self._noise_hz * (until_us - since_us) * 1e-6)
         pixel = np.repeat(np.arange(len(counts)), counts)
         t_us = self._random.uniform(since_us, until_us, len(pixel))
@@ -134,7 +134,7 @@ def _observe(
     pixels, times_us, inputs, last_us, last_input, last_output, level, blind_until_us, threshold_on, threshold_off,
     cutoff_rad_us, cutoff_reference, leak_per_us, refractory_us, noise_pixel, noise_us, noise_polarity,
 ):  # fmt: skip
-    """Go through the samples of each pixel; the arrays with a value for each pixel are brought up to date."""
+    """Process the samples of each pixel; the per-pixel state arrays are updated in place."""
     capacity = 1024
     whole, real = np.empty((2, capacity), np.int64), np.empty((6, capacity))
     events = noise = 0
@@ -147,7 +147,7 @@ def _observe(
         if cutoff_rad_us > 0:
             rad_us = cutoff_rad_us
             if cutoff_reference > 0:
-                # The inputs leak, the light does not.
+                # Remove the leak from the inputs to get the light.
                 light = np.exp((last_input[p] + inputs[i] - leak_per_us * (before_us + after_us)) / 2)
                 rad_us *= min(max(light / cutoff_reference, _NARROWEST), _WIDEST)
             # Exact for an input that is linear between samples.
@@ -170,7 +170,7 @@ def _observe(
             elif level[p] - after >= threshold_off[p]:
                 polarity, target = -1, level[p] - threshold_off[p]
             if polarity:
-                # The level may have been crossed already when it was set, by thresholds that shrink.
+                # With shrinking thresholds, the level may already be crossed when it is set.
                 at_us = max(now_us, min(after_us, before_us + (target - before) / slope)) if slope else now_us
             while noise < len(noise_pixel) and noise_pixel[noise] == p and noise_us[noise] <= now_us:
                 noise += 1

@@ -1,4 +1,4 @@
-"""Surroundings + motion + sensor: a scene folder like any other, with the truth beside it."""
+"""Simulate a scene folder with ground truth from surroundings, motion and sensor."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -28,41 +28,41 @@ _MESH_SIZE_M = 1.2
 _FRAME_RAYS = 16
 _EXPOSURES = 32
 _WHITE = 4.0
-"""Radiance at which frames are white: indoors the pattern's brightest patches are below 2."""
+"""Radiance at which frames saturate; indoors, the brightest patches are below 2."""
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What to simulate; the defaults are the demo scene."""
+    """Simulation settings; the defaults are the demo scene."""
 
     scene: SceneName = "handheld-room"
     """Surroundings and motion."""
     mesh: Path | None = None
-    """A textured mesh to put into the room instead of its boxes and balls, 1.2 m in size."""
+    """A textured mesh, scaled to 1.2 m, that replaces the boxes and balls in the room."""
     speed: float = 1.0
-    """How much faster than usual the camera moves."""
+    """Speed of the camera relative to the scene's default."""
     duration_s: float = 2.0
     width: int = 128
     height: int = 96
     focal_px: float = 110.0
     lens: CameraModel = "pinhole"
     distortion: tuple[float, ...] = ()
-    """Coefficients of the lens: k1 k2 p1 p2 [k3] of radtan, k1 k2 k3 k4 of equidistant."""
+    """Distortion coefficients: k1 k2 p1 p2 [k3] for radtan, k1 k2 k3 k4 for equidistant."""
     rays_per_pixel: Literal[1, 4, 16] = 16
-    """Over which a pixel averages: with fewer, a sharp edge comes in jumps of several events at once."""
+    """Rays that a pixel averages: with fewer, sharp edges cause jumps of several events at once."""
     sensor: SensorModel = field(default_factory=SensorModel)
-    """What a pixel does."""
+    """Pixel parameters."""
     tell_thresholds: bool = True
-    """Let the scene say the contrast thresholds, which recordings seldom do."""
+    """Write the contrast thresholds into the scene, although they are seldom known for real recordings."""
     keyframe_rate_hz: float = 20.0
     errors: TrajectoryErrors = field(default_factory=TrajectoryErrors)
-    """How the initial trajectory differs from the true one."""
+    """Errors of the initial trajectory."""
     frames: int = 12
-    """Validation frames, evenly spaced."""
+    """Number of evenly spaced validation frames."""
     exposure_ms: float = 0.0
-    """Above 0, the frames as a camera with this exposure takes them are written as well, into frames_blurred."""
+    """Above 0, frames with motion blur of this exposure time are also written, to frames_blurred."""
     seed: int = 0
-    """Of the motion, the room's pattern, the sensor and the trajectory errors."""
+    """Random seed of the motion, the room's pattern, the sensor and the trajectory errors."""
 
 
 def simulate(
@@ -71,7 +71,7 @@ def simulate(
     progress: Callable[[float], None] = lambda fraction: None,
     place: Place | None = None,
 ) -> Scene:
-    """Write a scene folder, of ``place`` where it is given; raises :class:`SimulationError` for impossible settings."""
+    """Simulate and write a scene folder, of ``place`` if given; raises :class:`SimulationError` for bad settings."""
     end_us = _check(settings)
     place = place or CATALOGUE[settings.scene](settings.seed)
     view = _view(place, settings)
@@ -103,7 +103,7 @@ def simulate(
 
 
 def _check(settings: Simulation) -> int:
-    """The recording's length in microseconds."""
+    """Validate the settings and return the recording's duration in microseconds."""
     positive = {
         name: getattr(settings, name) for name in "speed duration_s width height focal_px keyframe_rate_hz".split()
     }
@@ -149,13 +149,13 @@ def _times_us(end_us: int, rate_hz: float) -> np.ndarray:
 
 
 def _bounds(room: Room, scale: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """In the unit of the initial trajectory."""
+    """The room's bounds in the unit of the initial trajectory."""
     lower, upper = np.asarray(room.lower) - _MARGIN_M, np.asarray(room.upper) + _MARGIN_M
     return tuple((scale * lower).tolist()), tuple((scale * upper).tolist())
 
 
 def _write_frames(view: View, settings: Simulation, end_us: int, folder: Path) -> tuple[Frame, ...]:
-    """Sharp frames with the distance of everything in them and, if asked for, the same with motion blur."""
+    """Write sharp frames with distance maps and, optionally, the same frames with motion blur."""
     frames = []
     half_us = settings.exposure_ms * 500
     for k in range(settings.frames):

@@ -1,4 +1,4 @@
-"""What odometry gets wrong: the ways in which an initial trajectory differs from the true one."""
+"""Errors of an initial trajectory, as odometry makes them."""
 
 import math
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from ebarf_ns.geometry.trajectory import Poses, Trajectory
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Errors of an initial trajectory; positions in its own unit, metres where it is simulated."""
+    """Errors of an initial trajectory; positions in its own unit, metres in simulations."""
 
     position_noise: float = 0.03
-    """White noise of each keyframe (the paper's): standard deviation per axis."""
+    """White noise per keyframe, as in the paper: standard deviation per axis."""
     rotation_noise_rad: float = 0.03
     position_drift: float = 0.0
-    """A random walk: its largest distance from the truth."""
+    """Random walk: largest distance from the truth."""
     rotation_drift_rad: float = 0.0
     position_wander: float = 0.0
     """Low-pass noise, smooth over wander_s: standard deviation per axis."""
     rotation_wander_rad: float = 0.0
     wander_s: float = 0.2
-    """Time over which low-pass noise stays the same."""
+    """Correlation time of the low-pass noise."""
     scale: float = 1.0
-    """Positions are multiplied by this."""
+    """Factor on the positions."""
     clock_offset_us: int = 0
-    """Added to the keyframes' times."""
+    """Offset added to the keyframe times."""
     dropped: float = 0.0
-    """Share of the keyframes that is missing; the first and the last one stay."""
+    """Share of missing keyframes; the first and the last are kept."""
 
 
 NO_ERRORS = TrajectoryErrors(position_noise=0.0, rotation_noise_rad=0.0)
@@ -52,7 +52,7 @@ def check_errors(errors: TrajectoryErrors) -> None:
 
 
 def perturb(trajectory: Trajectory, errors: TrajectoryErrors, seed: int) -> Trajectory:
-    """A trajectory with errors; rotations and shifts are applied in each keyframe's own frame.
+    """Add errors to a trajectory; rotations and shifts are applied in each keyframe's local frame.
 
     Raises :class:`SimulationError` for errors that leave no trajectory.
     """
@@ -83,7 +83,7 @@ def _sizes(position: float, rotation_rad: float) -> Float[np.ndarray, "6"]:
 
 
 def _drift(count: int, seed: int) -> Float[np.ndarray, "keyframes 6"]:
-    """Random walks of rotation and position, each with largest norm 1."""
+    """Random walks of rotation and position, each with a maximum norm of 1."""
     walk = np.cumsum(_random(seed, 98).standard_normal((count, 2, 3)), axis=0)
     walk -= walk[0]
     return (walk / np.linalg.norm(walk, axis=-1, keepdims=True).max(axis=0)).reshape(count, 6)

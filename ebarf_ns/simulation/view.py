@@ -1,4 +1,4 @@
-"""What the pixels of a moving camera see: surroundings, motion and optics together."""
+"""Radiance at the pixels of a moving camera: surroundings, motion and optics combined."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,20 +7,21 @@ from typing import Protocol
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from numba import njit, prange
+from numba import prange
 from scipy.spatial.transform import Rotation
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.simulation.motion import Motion
 
 _PROBE_US = 250.0
 _KNOTS_EVERY_US = 50.0
-# Whose rays stay in the cache.
+# The rays of this many pixels stay in cache.
 _PIXELS_AT_ONCE = 16384
 
 
 def _subpixels(across: int) -> list[tuple[float, float]]:
-    """A turned square of rays over a pixel: no two share a column or row, so that every edge comes in as many steps."""
+    """A rotated grid of rays over a pixel: no two share a column or row, so that edges arrive in as many steps."""
     turned = [(j * across + across - 1 - i, i * across + j) for i in range(across) for j in range(across)]
     return [((column + 0.5) / across**2 - 0.5, (row + 0.5) / across**2 - 0.5) for column, row in turned]
 
@@ -29,7 +30,7 @@ _SUBPIXELS = {across * across: _subpixels(across) for across in (1, 2, 4)}
 
 
 class Surroundings(Protocol):
-    """Whatever rays can be cast into."""
+    """A scene that rays can be cast into."""
 
     def cast(
         self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]
@@ -40,19 +41,19 @@ class Surroundings(Protocol):
 
 @dataclass(frozen=True)
 class View:
-    """A camera carried through surroundings."""
+    """A camera moving through surroundings."""
 
     surroundings: Surroundings
     motion: Motion
     camera: Camera
     rays_per_pixel: int = 16
-    """1, 4 or 16, over which a pixel's radiance is averaged."""
+    """Number of rays averaged per pixel: 1, 4 or 16."""
 
     def see(
         self, pixel: Int64[np.ndarray, "pixels"], t_us: Float[np.ndarray, "pixels"]
     ) -> tuple[Float[np.ndarray, "pixels"], Float[np.ndarray, "pixels"]]:
-        """Mean radiance and nearest distance [m] of pixels (row-major numbers), each at a time of its own."""
-        # In so short a time no motion differs from a straight one by more than a billionth.
+        """Mean radiance and nearest distance [m] of pixels (row-major index), each at its own time."""
+        # Over such short intervals, motion is linear to within a billionth.
         first_us, last_us = (t_us.min(), t_us.max()) if len(t_us) else (0.0, 0.0)
         knots_us = first_us + _KNOTS_EVERY_US * np.arange(2 + int((last_us - first_us) / _KNOTS_EVERY_US))
         rotation, position = self.motion.rotation(knots_us), self.motion.position(knots_us)
@@ -68,7 +69,7 @@ class View:
     def images(
         self, t_us: Float[np.ndarray, "times"]
     ) -> tuple[Float[np.ndarray, "times pixels"], Float[np.ndarray, "times pixels"]]:
-        """Mean radiance and nearest distance [m] of all pixels at some times."""
+        """Mean radiance and nearest distance [m] of all pixels at the given times."""
         count = self.camera.width * self.camera.height
         pixel = np.tile(np.arange(count), len(t_us))
         radiance, distance = self.see(pixel, np.repeat(t_us, count))
@@ -77,7 +78,7 @@ class View:
     def velocities(
         self, t_us: Float[np.ndarray, "times"]
     ) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]:
-        """How the camera moves [m/s] and turns [rad/s], in its own frame."""
+        """Linear [m/s] and angular [rad/s] velocity in the camera frame."""
         seconds = 2e-6 * _PROBE_US
         earlier, later = t_us - _PROBE_US, t_us + _PROBE_US
         moved = self.motion.position(later) - self.motion.position(earlier)
@@ -88,12 +89,12 @@ class View:
     def fastest(
         self, distance: Float[np.ndarray, "pixels"], velocity: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3"]
     ) -> float:
-        """How fast that moves over the image which moves fastest [pixels/s]."""
+        """Largest image speed of any pixel [pixels/s]."""
         return float(_fastest(self._middles, self.pixels_per_rad, distance, velocity, turn).max())
 
     @cached_property
     def bearings(self) -> Float[np.ndarray, "pixels rays 3"]:
-        """Unit directions of the rays of each pixel, in the camera's frame."""
+        """Unit directions of the rays of each pixel in the camera frame."""
         centres = self.camera.pixel_grid().reshape(-1, 1, 2)
         return self.camera.bearings(centres + torch.tensor(_SUBPIXELS[self.rays_per_pixel])).numpy()
 
@@ -104,7 +105,7 @@ class View:
 
     @cached_property
     def pixels_per_rad(self) -> Float[np.ndarray, "pixels"]:
-        """The most pixels that a radian covers, about each pixel."""
+        """Largest number of pixels per radian at each pixel."""
         centres = self.camera.pixel_grid().reshape(-1, 1, 2)
         corners = self.camera.bearings(centres + torch.tensor([(-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5)])).numpy()
         sides = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=-1)
@@ -113,7 +114,7 @@ class View:
 
 @njit(cache=True, parallel=True)
 def _fastest(bearings, pixels_per_rad, distance, velocity, turn):
-    """Each pixel's speed over the image: bearings change by (v - (v·b) b) / d + turn x b as the camera moves."""
+    """Image speed of each pixel: bearings change by (v - (v·b) b) / d + turn x b as the camera moves."""
     speed = np.empty(len(bearings))
     for i in prange(len(bearings)):
         x, y, z = bearings[i]
@@ -127,9 +128,9 @@ def _fastest(bearings, pixels_per_rad, distance, velocity, turn):
 
 @njit(cache=True, parallel=True)
 def _rays(bearings, pixel, place, rotation, position):
-    """Origins and directions in the world: the first ray of each pixel, then the second of each.
+    """Ray origins and directions in the world frame: the first ray of each pixel, then the second of each.
 
-    ``place`` is the number of the pose before each pixel's time, with the fraction of the way to the next.
+    ``place`` is the index of the pose before each pixel's time plus the fraction of the way to the next.
     """
     per_pixel = bearings.shape[1]
     origin = np.empty((len(pixel) * per_pixel, 3))

@@ -1,4 +1,4 @@
-"""A whole comparison in miniature, by the command that users type."""
+"""A whole comparison in miniature, through the user's command."""
 
 import json
 import shutil
@@ -62,7 +62,7 @@ def test_scenes_of_one_seed_share_their_events(comparison: Path):
     true, drift = made(comparison, "true"), made(comparison, "drift")
     assert true.events == drift.events and true.events.is_file()
     assert true.trajectory.read_text() != drift.trajectory.read_text()
-    # A trajectory in another unit is that of a scene in another unit.
+    # A trajectory in another unit comes with bounds in that unit.
     assert np.allclose(np.array(drift.bounds), 2 * np.array(true.bounds))
 
 
@@ -70,13 +70,13 @@ def test_diagrams_and_tables_show_every_method(comparison: Path):
     out = comparison / "out"
     curves, profile = ((out / name).read_text() for name in ("work_precision.svg", "profile.svg"))
     assert all(f"<!-- {name} -->" in curves for name in ("ebarf", "floor", "as given"))
-    # Floors have no problem of their own to solve.
+    # Floors are not part of the performance profile.
     assert "<!-- ebarf -->" in profile and "<!-- floor -->" not in profile
     tables = (out / "tables.md").read_text()
     assert "| tiny | drift | ebarf |" in tables and "not reached" in tables and "1 training failed" in tables
 
 
-def test_a_stopped_comparison_goes_on_where_it_stopped(comparison: Path):
+def test_a_stopped_comparison_resumes(comparison: Path):
     out = comparison / "out"
     before = {path: path.stat().st_mtime_ns for path in (out / "results").glob("*.json")}
     removed = next(path for path in before if "-ebarf-" in path.name)
@@ -87,7 +87,7 @@ def test_a_stopped_comparison_goes_on_where_it_stopped(comparison: Path):
     assert {path for path in before if after[path] != before[path]} == {removed}
 
 
-def test_a_scene_made_anew_is_measured_anew(comparison: Path, tmp_path: Path):
+def test_a_changed_scene_is_measured_again(comparison: Path, tmp_path: Path):
     folder = shutil.copytree(made(comparison, "drift").events.parent, tmp_path / "scene")
     (tmp_path / "given.yaml").write_text(
         f"methods: {{broken: ebarf --pipeline.model.samples 0}}\nscenes: {{given: {folder}}}\n"
@@ -100,7 +100,7 @@ def test_a_scene_made_anew_is_measured_anew(comparison: Path, tmp_path: Path):
         assert len(list((tmp_path / "out" / "results").iterdir())) == number + 1
 
 
-def test_facts_are_stated_beside_a_scene_and_no_floor_goes_without_a_reference(comparison: Path, tmp_path: Path):
+def test_sensor_facts_can_be_stated_and_floors_need_a_reference(comparison: Path, tmp_path: Path):
     folder = shutil.copytree(made(comparison, "drift").events.parent, tmp_path / "scene")
     content = json.loads((folder / "scene.json").read_text())
     (folder / "scene.json").write_text(json.dumps({**content, "groundtruth": None, "contrast_threshold": None}))
@@ -120,7 +120,7 @@ def test_facts_are_stated_beside_a_scene_and_no_floor_goes_without_a_reference(c
     assert given.contrast_threshold is None and scene.trajectory.samefile(given.trajectory)
 
 
-def test_bounds_of_another_world_than_the_groundtruths_are_named(comparison: Path, tmp_path: Path):
+def test_bounds_in_another_frame_than_the_groundtruth_are_an_error(comparison: Path, tmp_path: Path):
     folder = shutil.copytree(made(comparison, "drift").events.parent, tmp_path / "scene")
     path = read_scene(folder).groundtruth
     assert path
@@ -134,7 +134,7 @@ def test_bounds_of_another_world_than_the_groundtruths_are_named(comparison: Pat
     assert finished.code == 2 and "expected both in one world" in finished.errors
 
 
-def test_another_program_joins_by_its_files(comparison: Path, tmp_path: Path):
+def test_another_program_is_compared_by_its_files(comparison: Path, tmp_path: Path):
     scene = made(comparison, "drift")
     assert scene.groundtruth
     shutil.copy(scene.groundtruth, tmp_path / "theirs.txt")
@@ -155,6 +155,6 @@ def test_another_program_joins_by_its_files(comparison: Path, tmp_path: Path):
     assert finished.code == 2 and "expected a picture for every frame" in finished.errors
 
 
-def test_a_manifest_that_is_none_is_refused_in_one_line(tmp_path: Path):
+def test_an_invalid_manifest_is_refused_in_one_line(tmp_path: Path):
     finished = run_command("ebarf", "bench", "enigne")
     assert finished.code == 2 and "enigne" in finished.errors and "Traceback" not in finished.errors

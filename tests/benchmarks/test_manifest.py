@@ -35,7 +35,7 @@ def read(tmp_path: Path, text: str):
     return read_manifest(path)
 
 
-def test_a_manifest_says_what_is_compared(tmp_path: Path):
+def test_a_manifest_defines_the_comparison(tmp_path: Path):
     manifest = read(tmp_path, WHOLE)
     assert manifest.name == "some" and manifest.seeds == (0, 4) and manifest.seconds == (5, 10)
     assert manifest.methods["floor"].words[1:] == ["--pipeline.model.camera-optimizer.mode", "off"]
@@ -59,7 +59,7 @@ def test_floors_are_trained_once_whatever_the_trajectory(tmp_path: Path):
     assert {job.trajectory for job in found if job.method == "floor"} == {TRUE}
     names = {job.name("this") for job in found}
     assert len(names) == len(found) and all("/" not in name for name in names)
-    # What is made of something else has another name: its result is not taken for this one's.
+    # A different definition has a different name, so that results are not confused.
     assert found[0].name("this") != found[0].name("that")
 
 
@@ -100,7 +100,7 @@ def test_shipped_manifests_are_whole(path: Path):
         (WHOLE.replace("  slide:", "  ../slide:"), "a name in scenes is '../slide'"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, complaint: str):
+def test_errors_are_named(tmp_path: Path, text: str, complaint: str):
     with pytest.raises(BenchmarkError, match=complaint):
         read(tmp_path, text)
 

@@ -48,6 +48,41 @@ def test_inspect_points_at_what_is_wrong(tiny_scene: Path, tmp_path: Path):
     assert "left out of training: 1" in text
 
 
+def test_inspect_says_what_looks_wrong_first_and_flags_of_the_plan_a_line_each(tiny_scene: Path, tmp_path: Path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene [1]")
+    content = json.loads((scene / "scene.json").read_text())
+    (scene / "scene.json").write_text(json.dumps({**content, "bounds": None}))
+    title, *lines = run_ok("ebarf", "inspect", scene).splitlines()
+    assert title == str(scene) and lines[0].startswith("! no bounds in scene.json") and "--farthest" in lines[0]
+    assert "nothing suspicious" not in lines
+    plan = json.loads(run_ok("ebarf", "inspect", scene, "--json"))["plan"]
+    for line in plan:
+        flag = "--" + line["field"].replace("_", "-")
+        assert f"{flag} = {line['value']}: {line['reason']}" in lines
+
+
+def test_inspect_is_told_what_a_recording_does_not_say(tmp_path: Path):
+    path = tmp_path / "events.txt"
+    path.write_text("".join(f"{k % 40} {k % 30} {k} {k % 2}\n" for k in range(0, 4000, 7)))
+    words = ["inspect", path, "--event-columns", "x y t p", "--json"]
+    for unit, factor in (("us", 1), ("ms", 1000)):
+        said = json.loads(run_ok("ebarf", *words, "--event-time-unit", unit))
+        assert (said["start_us"], said["end_us"], said["events"]) == (0, 3997 * factor, 572)
+    refused = run_command("ebarf", "inspect", tmp_path, "--event-columns", "x y t p")
+    assert refused.code == 2
+
+
+def test_a_path_of_nearly_that_name_is_offered(tmp_path: Path):
+    source = ecd_folder(tmp_path / "recording")
+    for words in (
+        ("inspect", tmp_path / "recoding"),
+        ("process", "ecd", tmp_path / "recoding", "--output", tmp_path / "scene"),
+        ("trajectory", "compare", tmp_path / "recoding" / "groundtruth.txt", source / "groundtruth.txt"),
+    ):
+        finished = run_command("ebarf", *words)
+        assert finished.code == 2 and f"did you mean {source}" in finished.errors and finished.errors.count("\n") == 1
+
+
 def test_trajectory_compare_prints_one_object(tiny_scene: Path):
     output = run_ok(
         "ebarf", "trajectory", "compare", tiny_scene / "trajectory.txt", tiny_scene / "groundtruth.txt", "--json"
@@ -181,6 +216,10 @@ def test_errors_that_leave_no_trajectory_are_said_before_anything_is_simulated(t
 def test_evaluate_of_no_run_is_one_line(tmp_path: Path):
     finished = run_command("ebarf", "evaluate", tmp_path)
     assert finished.code == 2 and "expected the folder of a training run" in finished.errors
+    (tmp_path / "scene" / "ebarf" / "run").mkdir(parents=True)
+    (tmp_path / "scene" / "ebarf" / "run" / "metrics.jsonl").touch()
+    finished = run_command("ebarf", "evaluate", tmp_path)
+    assert f"such as {tmp_path / 'scene' / 'ebarf' / 'run'}" in finished.errors
 
 
 def test_swapped_columns_of_a_real_file_are_caught(tmp_path: Path, tiny_scene: Path):

@@ -1,4 +1,4 @@
-"""A sensor of the tests' own: textures that slide across a row of pixels, seen with thresholds and blind times."""
+"""A test sensor: textures that slide across rows of pixels, seen with thresholds and refractory periods."""
 
 from collections.abc import Callable
 
@@ -14,19 +14,19 @@ _SAMPLES_PER_PX = 8
 
 
 def one_way(t_s: np.ndarray) -> np.ndarray:
-    """Shift in pixels of a pan that never comes back."""
+    """Shift in pixels of a pan that never returns."""
     return 90 * t_s + 6 * np.sin(5 * t_s)
 
 
 def to_and_fro(t_s: np.ndarray) -> np.ndarray:
-    """Shift in pixels of a camera moved by hand."""
+    """Shift in pixels of a handheld camera."""
     return 30 * np.sin(4 * t_s) + 8 * np.sin(11 * t_s + 1)
 
 
 def photograph(random: np.random.Generator, length: int) -> np.ndarray:
-    """Log brightness along each row, at a spacing of an eighth of a pixel: edges of many sizes and contrasts.
+    """Log brightness along each row, sampled every eighth of a pixel: edges of many sizes and contrasts.
 
-    As in photographs, contrasts are heavy-tailed, and rows are in focus or not.
+    As in photographs, contrasts are heavy-tailed, and some rows are out of focus.
     """
     rows = np.zeros((HEIGHT, length))
     for row in rows:
@@ -59,7 +59,7 @@ def record(
     seconds: float = 2.0,
     seed: int = 0,
 ) -> Recording:
-    """What the sensor reports; after each event a pixel is blind, and then compares with what it sees."""
+    """The sensor's events; after a refractory period, a pixel takes the current brightness as its reference."""
     random = np.random.default_rng(seed)
     t_us = np.arange(0, seconds * 1e6, STEP_US)
     shift = (motion(t_us * 1e-6) * _SAMPLES_PER_PX).astype(np.float64)
@@ -73,14 +73,14 @@ def record(
         return rows[:, left] + (at - left) * (rows[:, left + 1] - rows[:, left])
 
     before = seen(0)
-    # Levels lie anywhere within the thresholds, as those of a sensor that has run for a while.
+    # Reference levels are spread over the thresholds, as in a sensor that has run for a while.
     level = before + random.uniform(-off, on, before.shape)
     free_us = np.zeros_like(before)
     found = []
     for k in range(1, len(t_us)):
         after, now_us = seen(k), np.full(before.shape, t_us[k - 1])
         for _ in range(20):
-            # A pixel that sees again within this step takes what it sees then as its level.
+            # A refractory period that ends within this step resets the level at that time.
             opens = (free_us > now_us) & (free_us < t_us[k])
             part = (free_us - t_us[k - 1]) / STEP_US
             level = np.where(opens, before + part * (after - before), level)
@@ -105,5 +105,5 @@ def record(
 
 
 def index_of(recording: Recording) -> PairIndex:
-    """The recording, ordered by pixel."""
+    """Index of the recording."""
     return index_pairs(lambda: [recording], WIDTH, HEIGHT)

@@ -23,7 +23,7 @@ def recording(seed: int, count: int) -> Recording:
 
 
 def index_of(events: Recording, chunk: int = 50, memory_bytes: int = 1 << 40) -> PairIndex:
-    """Built from pieces of ``chunk`` events."""
+    """Index built from pieces of ``chunk`` events."""
     pieces = [events.select(slice(k, k + chunk)) for k in range(0, len(events), chunk)]
     return index_pairs(lambda: pieces, WIDTH, HEIGHT, memory_bytes)
 
@@ -37,7 +37,7 @@ def by_pixel(events: Recording) -> dict[int, list[int]]:
 
 @settings(max_examples=30)
 @given(st.integers(0, 1000), st.integers(30, 200), st.integers(1, 5))
-def test_every_pair_is_what_the_stream_says(seed: int, count: int, steps: int):
+def test_every_pair_matches_the_event_stream(seed: int, count: int, steps: int):
     events = recording(seed, count)
     index = index_of(events)
     steps = min(steps, index.max_steps)
@@ -58,7 +58,7 @@ def test_every_pair_is_what_the_stream_says(seed: int, count: int, steps: int):
 
 @settings(max_examples=30)
 @given(st.integers(0, 1000), st.integers(30, 200), st.integers(1, 5))
-def test_every_silent_pair_is_what_the_stream_says(seed: int, count: int, longest: int):
+def test_every_silent_pair_matches_the_event_stream(seed: int, count: int, longest: int):
     events = recording(seed, count)
     pairs = index_of(events).draw_silent(300, longest, (0, 1000), np.random.default_rng(seed))
     truth = by_pixel(events)
@@ -68,7 +68,7 @@ def test_every_silent_pair_is_what_the_stream_says(seed: int, count: int, longes
     ):
         rows = [row for row in truth.get(int(pixel), []) if events.t_us[row] <= t1]
         if not rows:
-            # Silent from the beginning: nothing has happened between any two moments.
+            # Silent from the beginning: no change between any two times.
             assert number == total == 0 and 0 <= t0 <= t1
             continue
         begin = len(rows) - 1 - int(number)
@@ -76,22 +76,22 @@ def test_every_silent_pair_is_what_the_stream_says(seed: int, count: int, longes
         assert events.t_us[rows[begin]] == t0 and events.polarity[rows[begin + 1 :]].sum() == total
 
 
-def test_silent_pairs_end_at_any_time_and_at_every_pixel_whether_it_ever_fires_or_not():
+def test_silent_pairs_cover_all_times_and_all_pixels_including_silent_ones():
     events = recording(1, 400)
     events = events.select(events.x + events.y < 3)
     pairs = index_of(events).draw_silent(20_000, 3, (0, 2000), np.random.default_rng(0))
     assert set(pairs.pixel.tolist()) == set(range(WIDTH * HEIGHT))
     never = ~np.isin(pairs.pixel, list(by_pixel(events)))
     assert never.any() and (pairs.event_count[never] == 0).all() and (pairs.duration_us[never] > 1000).any()
-    # After the last event of all, every time is as likely as any other.
+    # Times after the last event of all are uniform.
     late = pairs.t1_us[pairs.t1_us > 1000]
     assert np.abs(np.histogram(late, 10, (1000, 2000))[0] / len(late) - 0.1).max() < 0.02
     assert set(pairs.event_count.tolist()) == {0, 1, 2, 3}
 
 
-def test_pairs_are_drawn_uniformly_and_all_of_them():
+def test_all_pairs_are_drawn_uniformly():
     events = recording(1, 60)
-    # Times that tell every event from every other.
+    # Unique times identify the events.
     events = Recording(events.x, events.y, np.arange(60, dtype=np.int64), events.polarity)
     index = index_of(events)
     for steps in (1, 3):
@@ -100,7 +100,7 @@ def test_pairs_are_drawn_uniformly_and_all_of_them():
         drawn = index.draw(np.full(200 * expected, steps), np.random.default_rng(0))
         counts = np.unique(drawn.t1_us, return_counts=True)[1]
         assert len(counts) == expected
-        # 200 draws a pair on average: five standard deviations.
+        # 200 draws per pair on average; the bound is five standard deviations.
         assert np.abs(counts - 200).max() < 5 * np.sqrt(200)
 
 
@@ -117,7 +117,7 @@ def test_heldout_pairs_end_inside_and_training_pairs_stay_outside():
     assert len(drawn) == 500 and set(drawn.t1_us.tolist()) <= inside
 
 
-def test_where_nothing_is_accepted_nothing_is_drawn():
+def test_no_accepted_pair_gives_an_empty_batch():
     drawn = index_of(recording(2, 400)).draw_accepted(
         50, 10, np.random.default_rng(0), lambda pairs: np.zeros(len(pairs), bool)
     )
@@ -136,7 +136,7 @@ def test_training_pairs_across_a_heldout_block_count_the_events_in_it():
 
 @settings(max_examples=20)
 @given(st.integers(0, 1000), st.integers(1, 300), st.integers(16, 2000))
-def test_index_is_the_same_whatever_the_pieces_and_wherever_it_lies(seed: int, chunk: int, memory_bytes: int):
+def test_index_does_not_depend_on_chunk_size_or_storage(seed: int, chunk: int, memory_bytes: int):
     events = recording(seed, 300)
     whole, pieces = index_of(events, 300), index_of(events, chunk, memory_bytes)
     assert isinstance(pieces.events, np.memmap) and not isinstance(whole.events, np.memmap)
@@ -144,7 +144,7 @@ def test_index_is_the_same_whatever_the_pieces_and_wherever_it_lies(seed: int, c
         assert np.array_equal(getattr(whole, name), getattr(pieces, name))
 
 
-def test_batches_drawn_ahead_are_those_asked_for():
+def test_prefetched_batches_match_the_requested_ones():
     index = index_of(recording(3, 300))
     drawn: list[int] = []
 
@@ -159,7 +159,7 @@ def test_batches_drawn_ahead_are_those_asked_for():
     assert 14 in drawn
 
 
-def test_a_batch_depends_on_seed_and_number_alone():
+def test_a_batch_depends_only_on_seed_and_number():
     assert np.array_equal(batch_random(3, 7).integers(1 << 60, size=9), batch_random(3, 7).integers(1 << 60, size=9))
     assert not np.array_equal(
         batch_random(3, 7).integers(1 << 60, size=9), batch_random(3, 8).integers(1 << 60, size=9)
@@ -176,7 +176,7 @@ def test_steps_are_log_uniform():
     assert (draw_steps(100, 1, np.random.default_rng(0)) == 1).all()
 
 
-def test_no_second_event_anywhere_is_an_error():
+def test_no_pixel_with_two_events_is_an_error():
     events = Recording(
         np.arange(4, dtype=np.uint16), np.zeros(4, np.uint16), np.arange(4, dtype=np.int64), np.ones(4, np.int8)
     )
@@ -193,7 +193,7 @@ def test_accumulated_picture_shows_polarity():
     assert picture[0, 1] > 128 > picture[1, 2] and picture[2, 3] == 128
 
 
-def test_no_room_for_the_file_of_an_index_is_said(monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_is_reported(monkeypatch: pytest.MonkeyPatch):
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -202,7 +202,7 @@ def test_no_room_for_the_file_of_an_index_is_said(monkeypatch: pytest.MonkeyPatc
         index_of(recording(0, 300), memory_bytes=16)
 
 
-def test_a_system_that_cannot_reserve_room_has_an_index_on_disk_too(monkeypatch: pytest.MonkeyPatch):
+def test_an_index_on_disk_does_not_need_posix_fallocate(monkeypatch: pytest.MonkeyPatch):
     events = recording(3, 300)
     whole = index_of(events)
     monkeypatch.delattr("os.posix_fallocate", raising=False)
@@ -220,7 +220,7 @@ def test_edges_that_have_nearly_all_events_count_in_full():
     assert index.max_steps == 999 and index.events_before[-1] == len(pixel)
 
 
-def test_a_hot_pixel_counts_for_nothing_unless_asked_for():
+def test_hot_pixels_are_excluded_by_default():
     random = np.random.default_rng(0)
     pixel = random.permutation(np.r_[np.repeat(np.arange(100), 30), np.full(1000, 100)])
     x, zeros = pixel.astype(np.uint16), np.zeros(len(pixel), np.uint16)
@@ -234,15 +234,15 @@ def test_a_hot_pixel_counts_for_nothing_unless_asked_for():
 
 
 def spaced(intervals_us: np.ndarray) -> PairIndex:
-    """Brighter events of one pixel with these times between them."""
+    """ON events of one pixel at these intervals."""
     t_us = np.r_[0, np.cumsum(intervals_us)].astype(np.int64)
     zeros = np.zeros(len(t_us), np.uint16)
     return index_of(Recording(zeros, zeros, t_us, np.ones(len(t_us), np.int8))).with_hot_pixels()
 
 
-def test_blank_pixels_are_joined_with_blank_ones_at_one_time_and_with_no_others():
+def test_blank_pixels_are_paired_only_with_blank_ones_at_one_time():
     random = np.random.default_rng(0)
-    # The left half of the sensor fires, and the right half but for one pixel never does.
+    # The left half of the sensor fires; in the right half, only one pixel does.
     pixel = random.integers(0, 40 * 20, 20_000)
     x, y = np.where(pixel % 40 < 20, pixel % 40, 35), np.where(pixel % 40 < 20, pixel // 40, 10)
     t_us = np.sort(random.integers(0, 10**6, len(pixel)))
@@ -259,8 +259,8 @@ def test_blank_pixels_are_joined_with_blank_ones_at_one_time_and_with_no_others(
 
 
 @pytest.mark.parametrize("steps", [1, 3, 12])
-def test_what_a_blind_pixel_missed_is_estimated(steps: int):
-    # Brightness rises by a threshold in 4 ms; after each event the pixel is blind for 1 ms.
+def test_events_missed_in_the_refractory_period_are_estimated(steps: int):
+    # Brightness rises by a threshold in 4 ms; the refractory period is 1 ms.
     index = spaced(np.full(300, 5000))
     rate_per_us = 1 / 4000
     pairs = index.draw(np.full(50, steps), np.random.default_rng(0), 1000)
@@ -274,13 +274,13 @@ def test_what_a_blind_pixel_missed_is_estimated(steps: int):
 @pytest.mark.parametrize(
     ("polarity", "polarity_sum", "event_count"),
     [
-        # Blind half of the time: after each event as much is missed as that one says, up or down.
+        # Blind half of the time: one event of the same polarity is missed after each event.
         ([1, 1, -1, -1, 1, 1], 1, 9),
-        # Brightness that turns at every event says nothing of what comes after.
+        # Polarities that alternate give no rate to extrapolate.
         ([1, -1, 1, -1, 1, -1], -1, 5),
     ],
 )
-def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
+def test_missed_events_are_estimated_from_neighbours_of_equal_polarity(
     polarity: list[int], polarity_sum: int, event_count: int
 ):
     zeros = np.zeros(6, np.uint16)
@@ -290,26 +290,26 @@ def test_what_was_missed_goes_by_the_neighbours_of_the_same_sign(
     assert pairs.variance[0] == 5 + 8 * (event_count - 5)
 
 
-def test_what_was_missed_goes_by_the_faster_neighbour():
-    # A threshold takes 4 ms but for the one in the middle, 1 ms, as long as the pixel is blind before and after it.
+def test_missed_events_are_estimated_from_the_faster_neighbour():
+    # A threshold takes 4 ms, except for the middle one, which takes 1 ms, the refractory period.
     pairs = spaced(np.array([5000, 2000, 5000])).draw(np.array([3]), np.random.default_rng(0), 1000)
     assert pairs.polarity_sum[0] == 3 + 2
 
 
-def test_what_was_missed_before_the_silence_counts_too():
-    # As above, with the time in which the pixel was blind after its last event but one, and after its last, in it.
+def test_missed_events_before_a_silence_are_included():
+    # As above; the pairs span the refractory periods after the second to last and the last event.
     index = spaced(np.full(9, 5000))
     pairs = index.draw_silent(5000, 3, (20_000, 39_999), np.random.default_rng(0), 1000)
     pairs = pairs.select(pairs.pixel == 0)
     assert np.allclose(pairs.polarity_sum, pairs.event_count * 1.0)
     assert np.allclose(pairs.event_count, np.round(pairs.event_count / 1.25) * 1.25)
     assert np.allclose(pairs.variance, pairs.event_count / 1.25 * (1 + 8 * 0.25))
-    # What follows the very last one is not known.
+    # Nothing follows the very last event to estimate from.
     after = index.draw_silent(500, 1, (45_000, 50_000), np.random.default_rng(0), 1000)
     after = after.select(after.pixel == 0)
     assert set(after.event_count.tolist()) == {0.0, 1.0}
 
 
-def test_no_more_than_three_events_are_missed_at_a_time():
+def test_at_most_three_events_are_missed_at_a_time():
     pairs = spaced(np.full(10, 1001)).draw(np.array([9]), np.random.default_rng(0), 1000)
     assert (pairs.polarity_sum[0], pairs.event_count[0]) == pytest.approx((9 + 3 * 8, 9 + 3 * 8))

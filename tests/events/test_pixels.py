@@ -31,9 +31,9 @@ def test_edges_along_rows_columns_and_diagonals_are_not_hot():
     assert not hot_pixels(counts.ravel(), WIDTH).any()
 
 
-def test_dead_pixels_are_told_from_silent_ones_by_their_neighbours():
+def test_dead_pixels_are_distinguished_from_silent_ones_by_their_neighbours():
     counts = busy(30).reshape(HEIGHT, WIDTH)
-    # A blank wall: what is silent in it may well respond.
+    # A blank wall: its silent pixels may well work.
     counts[10:25, 15:35] = 0
     counts[3, 3] = 0
     dead = dead_pixels(counts.ravel(), WIDTH)
@@ -54,7 +54,7 @@ def test_a_blank_sky_above_a_skyline_is_not_dead():
     assert not dead_pixels(counts.ravel(), WIDTH).any()
 
 
-def test_all_pixels_dead_but_a_few_is_a_recording_that_tells_nothing_of_the_others():
+def test_a_few_active_pixels_do_not_make_the_others_dead():
     counts = np.zeros(WIDTH * HEIGHT, np.int64)
     counts[[100, 500, 900]] = 15
     assert not hot_pixels(counts, WIDTH).any() and not dead_pixels(counts, WIDTH).any()

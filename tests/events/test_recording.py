@@ -130,7 +130,7 @@ def test_between_includes_both_ends(tmp_path: Path):
     assert len(recording.between(11, 12)) == 0
 
 
-def test_the_span_is_checked_without_reading_what_lies_between(tmp_path: Path):
+def test_the_span_is_checked_without_reading_the_middle(tmp_path: Path):
     file = RecordingFile(write(tmp_path / "e.h5", t=[10, 2500, 5]), WIDTH, HEIGHT)
     with pytest.raises(RecordingError, match="/events/t row 2 is 5, expected a time not before"):
         file.span()

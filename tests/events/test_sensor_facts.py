@@ -1,4 +1,4 @@
-"""What the recording tells of its sensor, on recordings of a sensor and textures that are the tests' own."""
+"""Sensor properties estimated from recordings of the test sensor."""
 
 from pathlib import Path
 
@@ -32,26 +32,26 @@ def test_the_ratio_of_thresholds_is_found_within_six_percent(texture, motion, re
 
 @pytest.mark.parametrize("jitter_us", [0, 50])
 @pytest.mark.parametrize("refractory_us", [500, 1000, 3000])
-def test_blind_times_are_found(refractory_us: int, jitter_us: int):
+def test_refractory_periods_are_found(refractory_us: int, jitter_us: int):
     index = index_of(record(photograph, to_and_fro, refractory_us=refractory_us, jitter_us=jitter_us))
     found = estimated_refractory_us(index)
     assert found.value == pytest.approx(refractory_us, rel=0.35)
     assert found.low <= found.value <= found.high
 
 
-def test_no_blind_time_is_made_of_the_fastest_edges_but_for_a_small_part_of_the_usual_interval():
+def test_fast_edges_are_hardly_mistaken_for_a_refractory_period():
     index = index_of(record(photograph, to_and_fro))
     assert estimated_refractory_us(index).value < 200
 
 
 def test_pixels_that_fire_at_once_are_not_blind():
     made = record(photograph, to_and_fro)
-    # Edges that are crossed within a microsecond, as sharp ones of a simulator are.
+    # Edges that are crossed within a microsecond, as in simulations.
     again = Recording(*(np.repeat(column, 2) for column in (made.x, made.y, made.t_us, made.polarity)))
     assert estimated_refractory_us(index_of(again)).value == 0
 
 
-def test_a_recording_that_hardly_tells_anything_is_not_made_to():
+def test_a_tiny_recording_gives_no_estimates():
     random = np.random.default_rng(0)
     t_us = np.sort(random.integers(0, 10**6, 3000))
     x, y = random.integers(0, WIDTH, 3000).astype(np.uint16), random.integers(0, HEIGHT, 3000).astype(np.uint16)
@@ -59,7 +59,7 @@ def test_a_recording_that_hardly_tells_anything_is_not_made_to():
     assert one_sided.refractory_us.value == 0 and one_sided.threshold_ratio == UNKNOWN_SENSOR.threshold_ratio
 
 
-def test_what_is_stated_goes_before_what_is_found():
+def test_given_values_take_precedence_over_estimates():
     made = record(photograph, to_and_fro, 0.3, 0.2, 1000)
     counted, ignored = (identify(index_of(made), refractory_us) for refractory_us in (1000, 0))
     assert counted.refractory_us == ignored.refractory_us
@@ -77,7 +77,7 @@ def test_what_is_stated_goes_before_what_is_found():
         ("photos_davis", (240, 180), (350, 700), (1.24, 1.4), 10),
     ],
 )
-def test_recordings_from_elsewhere(name: str, size: tuple[int, int], blind_us: tuple, ratio: tuple, hot: int):
+def test_foreign_recordings(name: str, size: tuple[int, int], blind_us: tuple, ratio: tuple, hot: int):
     file = RecordingFile(Path(DATA / name / "events.h5"), *size)
     facts = identify_recording(file, (0, 10**9))
     assert blind_us[0] <= facts.refractory_us.value <= blind_us[1]

@@ -20,7 +20,7 @@ Light = Callable[[float], np.ndarray]
 
 
 def indexed(events: Events) -> tuple[np.ndarray, np.ndarray]:
-    """Events and beginnings of pixels, as the functions take them."""
+    """Sorted events and the start index of each pixel."""
     pixel, t_us, polarity = (column[np.argsort(events[1], kind="stable")] for column in events)
     x, y = (pixel % WIDTH).astype(np.uint16), (pixel // WIDTH).astype(np.uint16)
     recording = Recording(x, y, t_us.astype(np.int64), polarity.astype(np.int8))
@@ -29,7 +29,7 @@ def indexed(events: Events) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fired(light: Light, seconds: float, step_us: int = 200, blind_us: int = 0) -> Events:
-    """What pixels with thresholds of 0.25 (3 % of mismatch) report of a log brightness over time in seconds."""
+    """Events of pixels with thresholds of 0.25 (3 % mismatch) for a log brightness over time in seconds."""
     random = np.random.default_rng(0)
     thresholds = {sign: 0.25 * (1 + 0.03 * random.standard_normal(SHAPE)) for sign in (1, -1)}
     before = light(0.0)
@@ -72,7 +72,7 @@ def bars(period: int) -> np.ndarray:
 
 
 def moving(picture: np.ndarray, vx: float, vy: float = 0, shaken_hz: float = 0) -> Light:
-    """A picture that passes at so many pixels a second, or is shaken."""
+    """A picture that moves at a velocity in pixels per second, or is shaken."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
 
     def light(t: float) -> np.ndarray:
@@ -83,7 +83,7 @@ def moving(picture: np.ndarray, vx: float, vy: float = 0, shaken_hz: float = 0) 
 
 
 def lit(light: Light, hz: float, amplitude: float, where: np.ndarray = EVERYWHERE, drift_hz: float = 0) -> Light:
-    """The same under a lamp, whose rate changes by ``drift_hz`` a second."""
+    """The same scene under a flickering lamp whose frequency drifts by ``drift_hz`` per second."""
 
     def under_lamp(t: float) -> np.ndarray:
         return light(t) + where * np.log1p(amplitude * np.cos(2 * np.pi * (hz + drift_hz * t / 2) * t))
@@ -119,13 +119,13 @@ def test_ordinary_clocks_have_no_step(ordinary: Events):
     assert clock_step_us(noise(1.0, 1000, 1)[1]) == 1
     for few in ([], [5], [5, 10], [7] * 1000, [7, 1007] * 500):
         assert clock_step_us(np.array(few, np.int64)) == 1
-    # Of two clocks, only one has steps.
+    # Two mixed clocks, only one of which has steps.
     mixed = np.where(np.arange(len(ordinary[1])) % 20 == 0, ordinary[1], ordinary[1] // 100 * 100)
     assert clock_step_us(mixed) == 1
 
 
 def doubled(events: Events, share: float, within_us: int) -> Events:
-    """Some events come again, at most so much later."""
+    """Repeat a share of the events up to ``within_us`` later."""
     random = np.random.default_rng(3)
     pixel, t_us, polarity = events
     again = random.choice(len(pixel), int(share * len(pixel)), replace=False)
@@ -157,7 +157,7 @@ def test_no_doubles_without_a_gap(speed: float, blind_us: int, jitter_us: float)
     assert doubles(*indexed((pixel, np.maximum(t_us + jitter, 0).astype(np.int64), polarity))) == (0.0, 0)
 
 
-def test_no_doubles_in_edges_that_cross_at_once_nor_in_noise_nor_in_next_to_nothing():
+def test_no_doubles_in_flashes_noise_and_tiny_recordings():
     flash = fired(lambda t: np.full(SHAPE, 2.0 * (t > 0.1) - 2.0 * (t > 0.2)), 0.3)
     assert doubles(*indexed(flash)) == (0.0, 0)
     assert doubles(*indexed(noise(1.0, 1000, 20))) == (0.0, 0)
@@ -185,7 +185,7 @@ def test_flicker_in_short_recordings_and_when_mains_drift(seconds: float):
 
 
 @pytest.mark.parametrize("step_us", [300, 1000, 2000])
-def test_flicker_is_found_with_a_blind_time_and_a_clock_of_steps(step_us: int):
+def test_flicker_is_found_with_a_refractory_period_and_a_stepped_clock(step_us: int):
     light = lit(moving(TEXTURE, 60, 13), 100, 0.3, TENTH)
     pixel, t_us, polarity = fired(light, 1.0, blind_us=500)
     found = flicker_hz(*indexed((pixel, t_us // step_us * step_us, polarity)), clock_step_us=step_us)
@@ -193,7 +193,7 @@ def test_flicker_is_found_with_a_blind_time_and_a_clock_of_steps(step_us: int):
     np.testing.assert_array_equal(found.pixels, TENTH.ravel())
 
 
-def test_a_recording_too_short_to_tell_has_no_flicker():
+def test_a_too_short_recording_has_no_flicker():
     found = flicker_hz(*indexed(fired(lit(moving(TEXTURE, 60), 100, 0.6), 0.19)))
     assert found.hz is None and found.share_of_pixels == 0 and found.pixels.shape == (PIXELS,)
     assert not found.pixels.any()
@@ -205,32 +205,32 @@ def test_a_recording_too_short_to_tell_has_no_flicker():
         moving(TEXTURE, 60, 13),
         moving(TEXTURE, 100),
         moving(TEXTURE, 500),
-        # Edges that cross all pixels of a column at once, and one column after another at a constant rate.
+        # Edges that cross all pixels of a column at once, column by column at a constant rate.
         moving(bars(8), 100),
         moving(bars(8), 500),
-        # A grating under which each pixel turns at 100 Hz, one after another.
+        # A grating under which pixels oscillate at 100 Hz with different phases.
         moving(bars(4), 400),
         moving(bars(12), 1200),
         moving(TEXTURE, 20, 5, shaken_hz=80),
-        # Frames of 25 Hz that disturb all pixels.
+        # 25 Hz frames that disturb all pixels.
         lambda t: moving(TEXTURE, 60, 13)(t) + 0.4 * (25 * t % 1 < 0.05),
         # A lamp too faint for pixels to follow.
         lit(moving(TEXTURE, 60, 13), 100, 0.05),
     ],
 )
 @pytest.mark.parametrize("seconds", [0.3, 1.5])
-def test_what_moves_is_no_flicker(light: Light, seconds: float):
+def test_motion_is_not_flicker(light: Light, seconds: float):
     assert flicker_hz(*indexed(fired(light, seconds))).hz is None
 
 
 @pytest.mark.parametrize(("hz", "pixels"), [(20, PIXELS), (1000, 3), (1000, 300)])
-def test_noise_and_hot_pixels_are_no_flicker(hz: float, pixels: int):
+def test_noise_and_hot_pixels_are_not_flicker(hz: float, pixels: int):
     assert flicker_hz(*indexed(noise(1.0, hz, pixels))).hz is None
 
 
 @pytest.mark.parametrize("step", [1e6 / 3000, 1000, 2000, 10000, 1e6 / 60])
 @pytest.mark.parametrize("speed", [60, 400])
-def test_steps_of_the_clock_are_no_flicker(step: float, speed: float):
+def test_clock_steps_are_not_flicker(step: float, speed: float):
     pixel, t_us, polarity = fired(moving(TEXTURE, speed, 13), 1.0)
     t_us = np.rint(t_us // step * step).astype(np.int64)
     assert flicker_hz(*indexed((pixel, t_us, polarity)), clock_step_us=clock_step_us(t_us)).hz is None
@@ -246,14 +246,14 @@ def test_steps_of_the_clock_are_no_flicker(step: float, speed: float):
         ("photos_dim", 160, 120),
     ],
 )
-def test_recordings_from_elsewhere(name: str, width: int, height: int):
+def test_foreign_recordings(name: str, width: int, height: int):
     path = DATA / name / "events.h5"
     if not path.exists():
         pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")
     recording = read_recording(path, width, height)
     index = index_pairs(lambda: [recording], width, height)
     assert clock_step_us(recording.t_us) == 1
-    # Frames at 19.6 Hz disturb the office's pixels: lines at 98 and 118 Hz, which are no lamps.
+    # Frames at 19.6 Hz disturb the pixels of the office recording: lines at 98 and 118 Hz that are not lamps.
     assert flicker_hz(index.events, index.first).hz is None
     share, within_us = doubles(index.events, index.first)
     if name == "office_pan_tilt":

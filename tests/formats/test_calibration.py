@@ -1,4 +1,4 @@
-"""Calibrations as others write them are read, and what is wrong with one is said in a line that names file and key."""
+"""Foreign calibration files are read, and errors are one line that names file and key."""
 
 from pathlib import Path
 
@@ -91,7 +91,7 @@ def camera_of(tmp_path: Path, name: str, text: str) -> Camera:
 
 
 @pytest.mark.parametrize("name", list(READ))
-def test_what_other_programs_write_is_read(tmp_path: Path, name: str):
+def test_files_of_other_programs_are_read(tmp_path: Path, name: str):
     text, model = READ[name]
     camera = camera_of(tmp_path, name, text)
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 60, 61, 32, 24)
@@ -118,7 +118,7 @@ def test_the_pose_in_eurocs_file_is_that_of_the_camera_on_its_body(tmp_path: Pat
         ),
     ],
 )
-def test_a_model_that_is_not_known_is_named_beside_those_that_are(tmp_path: Path, name: str, text: str, words: str):
+def test_an_unknown_model_is_reported_with_the_known_ones(tmp_path: Path, name: str, text: str, words: str):
     with pytest.raises(SceneError, match=rf"{words} .*pinhole, radtan .* equidistant"):
         camera_of(tmp_path, name, text)
 
@@ -164,9 +164,7 @@ LAYOUTS = "expected a camera as kalibr, DSEC, EuRoC, ROS, OpenCV"
         ("a.h5", "no HDF5", "cannot be read as an HDF5 file"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_place_and_without_a_librarys_words(
-    tmp_path: Path, name: str, text: str, words: str
-):
+def test_errors_give_their_place_without_library_jargon(tmp_path: Path, name: str, text: str, words: str):
     with pytest.raises(SceneError, match=words) as raised:
         camera_of(tmp_path, name, text)
     said = str(raised.value)
@@ -184,7 +182,7 @@ def test_other_files_are_no_calibrations(tmp_path: Path):
         read_calibration(tmp_path)
 
 
-def test_of_several_cameras_only_the_one_asked_for_need_be_known(tmp_path: Path):
+def test_only_the_requested_camera_needs_a_known_model(tmp_path: Path):
     path = tmp_path / "chain.yaml"
     path.write_text(
         KALIBR.format(name="left", model="pinhole", lens="radtan")
@@ -197,7 +195,7 @@ def test_of_several_cameras_only_the_one_asked_for_need_be_known(tmp_path: Path)
         read_calibration(path, "right")
 
 
-def test_a_size_that_the_file_does_not_say_is_given(tmp_path: Path):
+def test_a_sensor_size_missing_in_the_file_can_be_given(tmp_path: Path):
     path = tmp_path / "intrinsics.yaml"
     path.write_text(f"camera_matrix: {MATRIX}\n")
     camera = next(iter(read_cameras(path, (64, 48)).values())).camera

@@ -1,4 +1,4 @@
-"""Files whose columns or times do not say what they are: values tell, or a flag is asked for."""
+"""Files with unnamed columns or time units: inferred from the values, or asked for by a flag."""
 
 from itertools import permutations
 from pathlib import Path
@@ -85,19 +85,19 @@ def test_rows_of_four_numbers_of_any_type_and_across(tmp_path: Path, suffix: str
         checked(open_recording(save(tmp_path / f"c{suffix}", rows[:, :3])), SIZE)
 
 
-def test_signed_polarities_and_unsorted_times_tell_as_well(tmp_path: Path):
+def test_orders_are_inferred_with_signed_polarities_and_unsorted_times(tmp_path: Path):
     changed = {"p": 2 * events()["p"] - 1}
     same(open_recording(save(tmp_path / "a.txt", table("xypt", **changed))))
     t = events()["t"] + 10**6
     t[[3, 9]] = t[[9, 3]]
     source = open_recording(save(tmp_path / "b.txt", table("xypt", t=t)))
-    assert source.columns == "xypt" and "though times do decrease" in source.notes[0]
+    assert source.columns == "xypt" and "although times decrease" in source.notes[0]
     with pytest.raises(RecordingError, match="--unsorted sort"):
         checked(source, SIZE)
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".npy", ".h5"])
-def test_where_two_orders_fit_a_flag_is_asked_for(tmp_path: Path, suffix: str):
+def test_an_ambiguous_order_asks_for_a_flag(tmp_path: Path, suffix: str):
     path = save(tmp_path / f"a{suffix}", table("txyp", t=3 * np.arange(400), x=np.arange(400) // 7))
     with pytest.raises(RecordingError, match="read as 't x y p' and as 'x t y p', expected --event-columns") as caught:
         open_recording(path)
@@ -107,7 +107,7 @@ def test_where_two_orders_fit_a_flag_is_asked_for(tmp_path: Path, suffix: str):
 
 def test_a_stated_order_is_taken_and_checked(tmp_path: Path):
     path = save(tmp_path / "a.txt", table("tyxp"))
-    with pytest.raises(RecordingError, match="are they swapped. --event-columns 't y x p' says so"):
+    with pytest.raises(RecordingError, match="are they swapped. Then use --event-columns 't y x p'"):
         checked(open_recording(path), SIZE)
     same(open_recording(path, columns="t, y, x, p"))
     with pytest.raises(RecordingError, match="--event-columns is 'xy', expected t, x, y and p once each"):
@@ -139,7 +139,7 @@ def test_names_of_columns():
 
 
 @pytest.mark.parametrize("kind", ["npz", "h5", "structured", "table", "mat", "txt", "double"])
-def test_times_of_single_precision_are_said_to_be_coarse(tmp_path: Path, kind: str):
+def test_single_precision_times_are_reported_as_coarse(tmp_path: Path, kind: str):
     late_s = 1504
     columns = events() | {"t": (late_s + events()["t"] * 1e-6).astype(np.float32)}
     path = tmp_path / ("a.npy" if kind in ("structured", "table", "double") else f"a.{kind}")
@@ -163,7 +163,7 @@ def test_times_of_single_precision_are_said_to_be_coarse(tmp_path: Path, kind: s
     source = open_recording(path)
     report = take_in(source, SIZE, Intake(), tmp_path / "out.h5")
     was = "were" if kind in ("txt", "double") else "are"
-    assert any(f"times {was} float32, which lie 122 us apart at 1504." in line for line in report.sentences())
+    assert any(f"times {was} float32, with a resolution of 122 us at 1504." in line for line in report.sentences())
 
 
 def test_a_folder_of_npz_is_read_by_the_numbers_of_its_files(tmp_path: Path):
@@ -209,7 +209,7 @@ def test_several_arrays_of_events_must_be_chosen_from(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5"])
-def test_fields_whose_names_say_nothing_are_told_by_their_values(tmp_path: Path, suffix: str):
+def test_fields_with_uninformative_names_are_inferred_from_their_values(tmp_path: Path, suffix: str):
     array = np.zeros(400, [("f0", "<i2"), ("f1", "<i2"), ("f2", "<i8"), ("f3", "i1")])
     for field, role in zip(array.dtype.names or (), "xytp", strict=True):
         array[field] = events()[role]

@@ -1,4 +1,4 @@
-"""A fuzz target for each reader: whatever bytes come, the end is events, or one line that names the file."""
+"""A fuzz target for each reader: any bytes result in events, or in one line that names the file."""
 
 from pathlib import Path
 
@@ -19,9 +19,9 @@ EDIT = st.tuples(
 
 
 def edited(content: bytes, edits: list[tuple[str, float, bytes]]) -> bytes:
-    """Content with some of its bytes flipped, gone, new, twice there or zero."""
+    """Content with some bytes flipped, deleted, inserted, duplicated or zeroed."""
     for kind, place, some in edits:
-        # The beginning, where headers are, is hit more often than what follows.
+        # The beginning, with the header, is hit more often than the rest.
         first, length = int(place**2 * len(content)), len(some)
         before, within, after = content[:first], content[first : first + length], content[first + length :]
         changed = {
@@ -42,7 +42,7 @@ def ends_well(path: Path, known: RecordingFormat | None = None) -> None:
     try:
         source = open_recording(path, known)
         report = take_in(source, SIZE, Intake(unsorted="sort"), output)
-        # What the file does not hold in full was never read.
+        # Incomplete events are never read.
         assert report.kept + sum(report.left_out.values()) == report.read + sum(source.dropped.values())
     except RecordingError as error:
         assert path.name in str(error) and "\n" not in str(error)
@@ -69,7 +69,7 @@ def test_edited_aedat4(tmp_path: Path, edits: list[tuple[str, float, bytes]]):
     if not whole.is_file():
         pytest.skip(f"no recordings at {DATA}; set EBARF_TEST_DATA to their folder")
     changed = tmp_path / "edited.aedat4"
-    # The sample is cut, as a whole one takes a second: header and the first packets.
+    # Only header and first packets, since a whole sample takes a second.
     changed.write_bytes(edited(whole.read_bytes()[:60_000], edits))
     ends_well(changed)
 

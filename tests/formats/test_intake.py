@@ -1,4 +1,4 @@
-"""Nothing is lost in silence on the way into a scene."""
+"""No event is lost silently on import."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ EVENT = st.tuples(st.integers(-5000, 5000), st.integers(0, 23), st.integers(0, 1
 
 
 @given(st.lists(EVENT, min_size=1).map(sorted), st.integers(1, 9))
-def test_events_in_order_arrive_as_they_are(tmp_path_factory: pytest.TempPathFactory, events: list, piece: int):
+def test_ordered_events_are_unchanged(tmp_path_factory: pytest.TempPathFactory, events: list, piece: int):
     path = tmp_path_factory.mktemp("intake") / "events.h5"
     report = take_in(source(events, piece), SIZE, Intake(), path)
     back, expected = read_recording(path, *SIZE), writers.recording(events)
@@ -78,7 +78,7 @@ def test_sorting_is_stable_and_loses_nothing(tmp_path_factory: pytest.TempPathFa
         ((1 << 62, 1, 1, 1), "t of event 2 is"),
     ],
 )
-def test_what_cannot_be_an_event_is_named(tmp_path: Path, event: writers.Event, words: str):
+def test_impossible_events_are_named(tmp_path: Path, event: writers.Event, words: str):
     with pytest.raises(RecordingError) as caught:
         taken(tmp_path, [(10, 1, 1, 0), (20, 1, 1, 1), event, (60, 1, 1, 1)])
     assert words in str(caught.value) and "camera.bin" in str(caught.value)
@@ -96,12 +96,12 @@ def test_signed_polarities(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("before", "after"), [((1 << 32) - 4, 3), ((1 << 31) - 4, 3), ((1 << 31) - 4, 3 - (1 << 31))])
-def test_counters_that_begin_anew_run_on(tmp_path: Path, before: int, after: int):
+def test_counter_overflows_are_unwrapped(tmp_path: Path, before: int, after: int):
     back, report = taken(tmp_path, [(before - 10, 1, 1, 0), (before, 1, 1, 0), (after, 1, 1, 0), (after + 9, 1, 1, 1)])
     assert np.diff(back.t_us).tolist() == [10, 7, 9] and sum(report.repaired.values()) == 1
 
 
-def test_each_thing_left_out_is_counted(tmp_path: Path):
+def test_everything_left_out_is_counted(tmp_path: Path):
     events = [(t, 5, 5, t % 2) for t in range(0, 4000, 10)] + [(4000, 1, 1, 1), (4000, 1, 1, 1), (4005, 1, 1, 0)]
     events += [(5000 + k, k % 24, k % 18, 1) for k in range(200)] + [(9000, 2, 2, 1)]
     hot = hot_pixels(source(events), SIZE, Intake(), 10)
@@ -109,8 +109,8 @@ def test_each_thing_left_out_is_counted(tmp_path: Path):
     intake = Intake(duplicates="drop", refractory_us=8, end_us=8000, time_offset_us=0)
     report = take_in(source(events), SIZE, intake, tmp_path / "events.h5", hot)
     assert report.left_out == {
-        "events outside the time window": 1, "events of 1 hot pixels": 403, "events twice over": 1,
-        "events within the refractory time": 1,
+        "events outside the time window": 1, "events of 1 hot pixels": 403, "duplicate events": 1,
+        "events in the refractory period": 1,
     }  # fmt: skip
     assert report.kept == len(events) - 406 and report.read == len(events)
     assert any("left out: 403" in sentence for sentence in report.sentences())
@@ -126,7 +126,7 @@ def test_nothing_left_is_an_error(tmp_path: Path):
         taken(tmp_path, [(10, 1, 1, 0), (20, 1, 1, 1)], start_us=100)
 
 
-def test_what_is_flipped_is_said_and_nothing_else_changes(tmp_path: Path):
+def test_flips_are_reported_and_nothing_else_changes(tmp_path: Path):
     events: list[writers.Event] = [(k, k % 24, k % 18, k % 3 % 2) for k in range(100)]
     straight, report = taken(tmp_path, events)
     assert not any("flipped" in sentence for sentence in report.sentences())

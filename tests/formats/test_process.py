@@ -1,4 +1,4 @@
-"""Datasets' folders, made here with the keys, types and clocks that their authors use, become scenes."""
+"""Synthetic dataset folders with the keys, types and clocks of their authors become scenes."""
 
 import json
 import shutil
@@ -63,7 +63,7 @@ def picture(path: Path, side: int = 16) -> None:
 
 
 def basalt(turn: Rotation) -> dict:
-    """TUM-VIE's own layout, with its event cameras as small as the events here."""
+    """TUM-VIE's layout, with event cameras as small as the test recording."""
     qx, qy, qz, qw = turn.as_quat().tolist()
     pose = {"px": 0.1, "py": 0.0, "pz": -0.05, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
     still = {"px": 0.0, "py": 0.0, "pz": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
@@ -193,7 +193,7 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
         (tmp_path / "odometry.txt").write_text(poses("s"))
         words += ["--trajectory", tmp_path / "odometry.txt"]
     if name == "eds":
-        # The real camera is larger than the events here need.
+        # The real camera is larger than the test recording.
         words += ["--start-us", 1_600_000_000_000_000]
     else:
         words += ["--start-us", 0]
@@ -203,11 +203,11 @@ def test_configurations_of_public_scenes(tmp_path: Path, path: Path):
     assert (scene.contrast_threshold is None) == (path.stem in ("eds_00", "evo_flyingroom"))
     if name == "eds":
         assert [frame.camera.fx for frame in scene.frames] == pytest.approx([766.536] * 3, abs=1e-3)
-        # The frames' camera is 4.4 mm behind that of the events.
+        # The frame camera is 4.4 mm behind the event camera.
         assert scene.frames[0].event_camera_from_frame_camera[2][3] == pytest.approx(-0.0044167, abs=1e-6)
 
 
-def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
+def test_a_reference_determines_an_unknown_time_unit(tmp_path: Path):
     source = tumvie(tmp_path / "source")
     lines = [line.split() for line in poses("us").splitlines()]
     permuted = "".join(f"{float(t)} {x} {y} {z} {qy} {qz} {qw} {qx}\n" for t, x, y, z, qx, qy, qz, qw in lines)
@@ -219,7 +219,7 @@ def test_times_told_by_a_reference_where_the_file_does_not(tmp_path: Path):
     assert (back * TURNS[0].inv()).magnitude() < 1e-6
 
 
-def test_flags_are_of_the_trajectory_and_leave_the_reference_as_it_says_itself(tmp_path: Path):
+def test_format_flags_apply_to_the_trajectory_and_not_to_the_reference(tmp_path: Path):
     source = tumvie(tmp_path / "source")
     wxyz = [line.split() for line in poses("s").splitlines()]
     lines = "".join(f"{t} {x} {y} {z} {qw} {qx} {qy} {qz}\n" for t, x, y, z, qx, qy, qz, qw in wxyz)
@@ -250,7 +250,7 @@ def test_the_right_camera_of_tum_vie_with_a_calibration_from_elsewhere_and_no_fr
         process("tumvie", source, tmp_path / "other", ProcessSettings(part="middle"))
 
 
-def test_a_calibration_that_is_given_goes_before_the_folders_own(tmp_path: Path):
+def test_a_given_calibration_takes_precedence_over_the_folders_own(tmp_path: Path):
     source = robust(tmp_path / "source")
     (source / "camera_calibration.npz").unlink()
     process("robust-e-nerf", source, tmp_path / "scene", ProcessSettings(camera=calibration(tmp_path)))
@@ -270,7 +270,7 @@ def test_a_calibration_that_is_given_goes_before_the_folders_own(tmp_path: Path)
         (ProcessSettings(events=Intake(start_us=10**9)), "expected --camera"),
     ],
 )
-def test_what_is_missing_is_said_and_leaves_no_folder(tmp_path: Path, settings: ProcessSettings, words: str):
+def test_missing_parts_are_reported_and_leave_no_folder(tmp_path: Path, settings: ProcessSettings, words: str):
     with pytest.raises(EbarfError, match=words):
         process("esim", esim(tmp_path / "source"), tmp_path / "scene", settings)
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
@@ -290,7 +290,7 @@ def test_a_trajectory_on_another_clock_is_an_error(tmp_path: Path):
 
 
 def odometry(tmp_path: Path, text: str, **settings: Any) -> tuple[list[str], list[str]]:
-    """What is said of the trajectory, and what is suspected of its scene."""
+    """Notes on the trajectory, and suspicions about its scene."""
     (tmp_path / "odometry.txt").write_text(text)
     known = ProcessSettings(camera=calibration(tmp_path), trajectory=tmp_path / "odometry.txt", **settings)
     source = tmp_path / "source"
@@ -323,7 +323,7 @@ def test_a_window_between_two_poses_is_a_suspicion(tmp_path: Path):
     assert any("lie between keyframes 0 and 1, 8.33 ms apart: times in another unit?" in one for one in suspicions)
 
 
-def test_a_torn_trajectory_is_said_and_suspected(tmp_path: Path):
+def test_a_discontinuous_trajectory_is_reported_and_suspected(tmp_path: Path):
     lines = [line.split() for line in poses("s").splitlines()]
     text = "".join(" ".join([t, f"{float(x) + 3 * (k > 99)}", *rest]) + "\n" for k, (t, x, *rest) in enumerate(lines))
     for sentences in odometry(tmp_path, text):
@@ -347,7 +347,7 @@ def test_a_zip_is_as_good_as_its_folder(tmp_path: Path):
     assert any("2,000 kept" in sentence for sentence in said)
 
 
-def test_what_goes_wrong_after_unpacking_is_not_the_zips_fault(tmp_path: Path):
+def test_errors_after_unpacking_do_not_blame_the_zip(tmp_path: Path):
     esim(tmp_path / "source")
     shutil.make_archive(str(tmp_path / "source"), "zip", tmp_path, "source")
     (tmp_path / "file").write_text("where a folder should be")
@@ -373,13 +373,13 @@ def test_frames_of_a_bag_are_those_beside_its_events(tmp_path: Path):
 
 GREY = np.arange(48 * 64).reshape(48, 64) % 180 + 20
 BAYER_ON = {"bayer_rggb8": (0, 0), "bayer_bggr8": (1, 1), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0)}
-"""Where the red pixels begin."""
+"""Position of the first red pixel."""
 
 
 def image_bag(
     path: Path, encoding: str, pixels: np.ndarray, size: tuple[int, int] = (64, 48), big: bool = False
 ) -> Path:
-    """Events and two images that say of themselves what is given."""
+    """Events and two images with the given fields."""
     store = types(1)
     image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in STEREO)
     with Writer1(path) as bag:
@@ -406,7 +406,7 @@ def frames_and_sentences(tmp_path: Path, bag: Path) -> tuple[list[np.ndarray], s
 @pytest.mark.parametrize("encoding", ["mono8", "8UC1", "bgr8", "rgb8", "bgra8", "rgba8", "bayer_rggb8", "bayer_gbrg8"])
 def test_frames_of_a_bag_are_grey_whatever_their_encoding(tmp_path: Path, encoding: str):
     channels = {"bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}.get(encoding, 1)
-    # Of a Bayer pattern, a picture that is the same everywhere can be told.
+    # For a Bayer pattern, only a uniform image has a known result.
     grey = np.full_like(GREY, 77) if "bayer" in encoding else GREY
     pixels = np.repeat(grey[..., None], channels, axis=-1).astype(np.uint8)
     found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels))
@@ -416,7 +416,7 @@ def test_frames_of_a_bag_are_grey_whatever_their_encoding(tmp_path: Path, encodi
 
 @pytest.mark.parametrize("encoding", [*BAYER_ON, "rgb8", "bgr8", "rgba8"])
 def test_red_is_taken_for_red(tmp_path: Path, encoding: str):
-    """It makes 30 per cent of grey, blue 11."""
+    """Red contributes 30 % to grey, blue 11 %."""
     if encoding in BAYER_ON:
         pixels, (row, column) = np.zeros((48, 64), np.uint8), BAYER_ON[encoding]
         pixels[row::2, column::2] = 200
@@ -428,7 +428,7 @@ def test_red_is_taken_for_red(tmp_path: Path, encoding: str):
 
 
 @pytest.mark.parametrize("big", [False, True])
-def test_sixteen_bits_of_which_ten_are_used_are_as_bright_as_they_can_be(tmp_path: Path, big: bool):
+def test_ten_bit_frames_in_sixteen_bits_are_scaled_to_full_range(tmp_path: Path, big: bool):
     pixels = (5 * GREY).astype(">u2" if big else "<u2")
     found, _ = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", "mono16", pixels, big=big))
     assert len(found) == 2 and all((one == 5 * GREY * 2**6).all() and one.dtype == np.uint16 for one in found)
@@ -444,7 +444,7 @@ def test_sixteen_bits_of_which_ten_are_used_are_as_bright_as_they_can_be(tmp_pat
         ("mono8", np.zeros((20, 30), np.uint8), (30, 20), "30 x 20 pixels, expected the event sensor's 64 x 48"),
     ],
 )
-def test_frames_of_a_bag_that_are_not_taken_are_counted(
+def test_skipped_frames_of_a_bag_are_counted(
     tmp_path: Path, encoding: str, pixels: np.ndarray, size: tuple[int, int], words: str
 ):
     found, said = frames_and_sentences(tmp_path, image_bag(tmp_path / "a.bag", encoding, pixels, size))
@@ -452,7 +452,7 @@ def test_frames_of_a_bag_that_are_not_taken_are_counted(
 
 
 @pytest.mark.parametrize(("spoilt", "count"), [(False, 2), (True, 0)])
-def test_compressed_frames_of_a_bag_are_taken(tmp_path: Path, spoilt: bool, count: int):
+def test_compressed_frames_of_a_bag_are_read(tmp_path: Path, spoilt: bool, count: int):
     store = types(1)
     image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in COMPRESSED)
     data = cv2.imencode(".png", GREY.astype(np.uint8))[1]
@@ -486,7 +486,7 @@ def test_frames_of_another_size_are_left_out_and_counted(tmp_path: Path):
     settings = ProcessSettings(sensor_size=(64, 48))
     said = " ".join(process("ecd", ecd(tmp_path / "source"), tmp_path / "scene", settings))
     assert "left out: 1 frame of 240 x 180 pixels, expected their camera's 64 x 48" in said
-    assert "3 of 3 frames within their span, 2 of which are taken along" in said
+    assert "3 of 3 frames within their span, 2 imported" in said
     assert len(read_scene(tmp_path / "scene").frames) == 2 and inspect_scene(tmp_path / "scene").events == 2000
 
 
@@ -499,7 +499,7 @@ def test_frames_of_another_size_are_left_out_and_counted(tmp_path: Path):
         ("images.txt", b"\xff\xfe0.1", "images.txt: byte 0 is not UTF-8 text"),
     ],
 )
-def test_frames_that_cannot_be_read_leave_no_scene_and_are_no_matter_without_frames(
+def test_unreadable_frames_leave_no_scene_and_do_not_matter_without_frames(
     tmp_path: Path, name: str, content: bytes, words: str
 ):
     source = ecd(tmp_path / "source")
@@ -512,7 +512,7 @@ def test_frames_that_cannot_be_read_leave_no_scene_and_are_no_matter_without_fra
 
 
 def stereo_bag(path: Path) -> Path:
-    """Two event cameras, with colour and grey pictures each."""
+    """Two event cameras, each with colour and grey images."""
     store = types(1)
     image, header, time = (store.types[f"{of}/msg/{name}"] for of, name in STEREO)
     with Writer1(path) as bag:
@@ -531,7 +531,7 @@ def stereo_bag(path: Path) -> Path:
     return path
 
 
-def test_an_equidistant_lens_without_coefficients_is_no_pinhole(tmp_path: Path):
+def test_an_equidistant_lens_without_coefficients_is_not_a_pinhole(tmp_path: Path):
     text = CALIBRATIONS["kalibr.yaml"][0].replace("[0.1, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0]")
     (tmp_path / "kalibr.yaml").write_text(text)
     camera = read_calibration(tmp_path / "kalibr.yaml").camera
@@ -559,7 +559,7 @@ CALIBRATIONS = {
 
 
 @pytest.mark.parametrize("name", list(CALIBRATIONS))
-def test_calibrations_as_others_write_them(tmp_path: Path, name: str):
+def test_foreign_calibrations(tmp_path: Path, name: str):
     text, model = CALIBRATIONS[name]
     (tmp_path / name).write_text(text)
     camera = read_calibration(tmp_path / name).camera
@@ -613,7 +613,7 @@ def test_real_calibrations_of_tum_vie(side: str):
 
 
 def saved(tmp_path: Path, factor: float, dtype: type = int) -> tuple[Path, ProcessSettings]:
-    """Events of 2 s whose times are in another unit, and poses."""
+    """2 s of events with times in another unit, and poses."""
     (tmp_path / "t.txt").write_text(poses("s"))
     np.savez(tmp_path / "a.npz", **columns() | {"t": (columns()["t"] * factor).astype(dtype)})  # pyright: ignore[reportArgumentType]
     return tmp_path / "a.npz", ProcessSettings(trajectory=tmp_path / "t.txt", camera=calibration(tmp_path))
@@ -623,7 +623,7 @@ def saved(tmp_path: Path, factor: float, dtype: type = int) -> tuple[Path, Proce
     ("factor", "dtype", "said", "unit"),
     [(1e-3, int, "us", "ms"), (1e3, int, "us", "ns"), (1e-3, float, "us", "ms"), (1.0, float, "us", "us")],
 )
-def test_a_unit_that_was_guessed_is_checked_beside_the_trajectory(
+def test_a_guessed_unit_is_checked_against_the_trajectory(
     tmp_path: Path, factor: float, dtype: type, said: str, unit: str
 ):
     path, settings = saved(tmp_path, factor, dtype)
@@ -638,7 +638,7 @@ def test_a_unit_that_was_guessed_is_checked_beside_the_trajectory(
     assert not any("suspicious" in sentence for sentence in sentences)
 
 
-def test_a_unit_that_is_stated_is_taken_and_inspection_doubts_it(tmp_path: Path):
+def test_a_stated_unit_is_used_and_doubted_by_inspection(tmp_path: Path):
     path, settings = saved(tmp_path, 1e-3)
     process("auto", path, tmp_path / "scene", replace(settings, event_time_unit="us"))
     (doubt,) = [one for one in inspect_scene(tmp_path / "scene").suspicions if "--event-time-unit" in one]

@@ -1,4 +1,4 @@
-"""EVT2, EVT2.1, EVT3 and DAT against writers of their own, and against a real camera's file."""
+"""EVT2, EVT2.1, EVT3 and DAT against independent writers, and against a real camera's file."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def columns(decoder: Decoder, content: bytes, size: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("encoding", list(ENCODERS))
 @given(events=EVENTS, size=st.integers(1, 40))
-def test_what_is_written_is_read_in_pieces_of_any_size(encoding, events: list[writers.Event], size: int):
+def test_written_events_are_read_back_in_chunks_of_any_size(encoding, events: list[writers.Event], size: int):
     content = ENCODERS[encoding](events)
     whole = columns(Decoder(encoding), content, len(content))
     assert [whole[2].tolist(), whole[0].tolist(), whole[1].tolist(), whole[3].tolist()] == [
@@ -37,9 +37,9 @@ def test_what_is_written_is_read_in_pieces_of_any_size(encoding, events: list[wr
 
 
 @pytest.mark.parametrize("encoding", list(ENCODERS))
-def test_time_runs_on_where_its_counter_begins_anew(encoding):
+def test_time_continues_when_its_counter_overflows(encoding):
     bits = 24 if encoding == "evt3" else 34
-    # As cameras do, with time words now and then.
+    # As from cameras, with occasional time words.
     times = [*range((1 << bits) - 3 * (1 << (bits - 3)), (1 << bits) + 3 * (1 << (bits - 3)), 1 << (bits - 3))]
     content = ENCODERS[encoding]([(t, 1, 2, 1) for t in times])
     assert Decoder(encoding).feed(content)[2].tolist() == times
@@ -62,7 +62,7 @@ def test_events_without_a_time_are_counted_and_left_out():
 
 
 @pytest.mark.parametrize(("encoding", "word"), [("evt2", "<u4"), ("evt2.1", "<u8")])
-def test_a_word_of_no_known_kind_is_named(tmp_path: Path, encoding: str, word: str):
+def test_a_word_of_unknown_type_is_named(tmp_path: Path, encoding: str, word: str):
     bits = np.dtype(word).itemsize * 8
     content = np.array([0x8 << (bits - 4), 0xB << (bits - 4)], word)
     if encoding == "evt2.1":
@@ -80,20 +80,20 @@ def test_reserved_words_of_evt3_are_counted_and_left_out(tmp_path: Path, kinds: 
     padded = np.insert(words, places, np.resize(np.array(kinds, np.uint16), 15))
     source = read_raw(writers.raw(tmp_path / "a.raw", "3.0", padded.tobytes()))
     assert np.concatenate([piece.t_us for piece in source.pieces]).tolist() == [t for t, *_ in events]
-    assert source.dropped["words of reserved kinds, as padding is"] == 15
-    # Much of one padding is padding still; much of everything is no EVT3.
+    assert source.dropped["words of reserved types, such as padding"] == 15
+    # Many words of one padding value are still padding; many diverse ones are not EVT3.
     padded = np.insert(words, np.repeat(places, 100), np.resize(np.array(kinds, np.uint16), 1500))
     source = read_raw(writers.raw(tmp_path / "b.raw", "3.0", padded.tobytes()))
     if len(kinds) == 1:
         assert sum(map(len, source.pieces)) == 300
     else:
-        with pytest.raises(RecordingError, match="no word of EVT3, and .*% are none .*expected the encoding of its"):
+        with pytest.raises(RecordingError, match="not an EVT3 word, like .*% of all .*expected the encoding of its"):
             list(source.pieces)
 
 
-def test_random_words_are_no_evt3(tmp_path: Path):
+def test_random_words_are_not_evt3(tmp_path: Path):
     content = np.random.default_rng(0).bytes(4000)
-    with pytest.raises(RecordingError, match="no word of EVT3"):
+    with pytest.raises(RecordingError, match="not an EVT3 word"):
         list(read_raw(writers.raw(tmp_path / "a.raw", "3.0", content)).pieces)
 
 
@@ -120,7 +120,7 @@ def test_dat_reads_back(tmp_path_factory: pytest.TempPathFactory, events: list[w
     assert list(zip(piece.t_us, piece.x, piece.y, piece.polarity, strict=True)) == events
 
 
-def test_dat_runs_on_after_32_bits(tmp_path: Path):
+def test_dat_continues_after_32_bits(tmp_path: Path):
     times = [(1 << 32) - 5, (1 << 32) + 5, (1 << 32) + 2**31]
     (piece,) = read_dat(writers.dat(tmp_path / "a.dat", [(t, 1, 1, 1) for t in times])).pieces
     assert piece.t_us.tolist() == times
@@ -145,7 +145,7 @@ ECF_EVENTS = st.lists(
 @pytest.mark.parametrize("layout", ["packed", "runs and packed", "runs and masks"])
 @given(events=ECF_EVENTS, far_us=st.integers(0, 1 << 40))
 def test_ecf_blocks_read_back_and_cut_ones_are_refused(layout: str, events: list[writers.Event], far_us: int):
-    # Runs of equal times, of none, and a long silence in the middle.
+    # Runs of equal times, single times, and a long silence in the middle.
     half = len(events) // 2
     made = [(t + (far_us if k >= half else 0), x, y, p) for k, (t, x, y, p) in enumerate(sorted(events))]
     content = writers.ecf(made, layout)

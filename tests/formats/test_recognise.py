@@ -1,4 +1,4 @@
-"""Formats are told from content, and every damage ends in one line."""
+"""Formats are recognised from content, and all damage results in a one-line error."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -201,7 +201,7 @@ def test_a_cut_file_is_an_error_or_the_events_before_the_cut(tmp_path: Path, nam
             assert str(cut) in str(error) and "\n" not in str(error)
             continue
         assert np.array_equal(back.t_us, expected.t_us[: len(back)]) and np.array_equal(back.x, expected.x[: len(back)])
-        # Nothing is missing that the file still holds; formats without lengths cannot know of what was cut off.
+        # All events still in the file are read; formats without lengths cannot detect truncation.
         assert len(back) == len(expected) or name.split(".")[-1] in ("raw", "dat", "txt"), place
 
 
@@ -238,7 +238,7 @@ def test_times_in_nanoseconds_where_hdf5_does_not_say_so(tmp_path: Path):
     assert np.array_equal(back.t_us, writers.recording(EVENTS).t_us)
 
 
-def test_a_file_of_a_ros2_bag_is_as_good_as_its_folder_and_alone_says_what_it_lacks(tmp_path: Path):
+def test_a_file_in_a_ros2_bag_opens_the_bag_and_alone_reports_missing_metadata(tmp_path: Path):
     folder = bag2(tmp_path / "ros2")
     (database,) = folder.glob("*.db3")
     assert np.array_equal(checked(open_recording(database), SIZE).t_us, writers.recording(EVENTS).t_us)
@@ -257,7 +257,7 @@ def test_a_file_of_mcap_is_read_alone(tmp_path: Path):
 
 
 @pytest.mark.parametrize("known", ["npz", "npy"])
-def test_one_kind_of_array_file_taken_for_another_is_named(tmp_path: Path, known: str):
+def test_a_mislabelled_array_file_is_named(tmp_path: Path, known: str):
     path = (npy_file if known == "npz" else npz)(tmp_path / ("a.npy" if known == "npz" else "a.npz"))
     with pytest.raises(RecordingError, match=r"a.np."):
         list(open_recording(path, known).pieces)  # pyright: ignore[reportArgumentType]
@@ -297,7 +297,7 @@ def test_a_cut_aedat4_is_an_error(tmp_path: Path):
         cut = tmp_path / "cut.aedat4"
         cut.write_bytes(content[:place])
         try:
-            # Behind the last packet there is but a table of contents.
+            # Only a table of contents follows the last packet.
             assert sum(map(len, open_recording(cut).pieces)) == 111_954
         except RecordingError as error:
             assert "cut.aedat4" in str(error)

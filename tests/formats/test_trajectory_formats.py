@@ -1,4 +1,4 @@
-"""One motion, written as every program writes it, is read as one motion."""
+"""One motion, written in the formats of many programs, is read back as the same motion."""
 
 import struct
 from pathlib import Path
@@ -52,7 +52,7 @@ def test_tum_in_any_unit_of_time(tmp_path: Path, unit: str):
     assert f"times in {unit}" in notes[0]
 
 
-def test_poses_out_of_order_are_sorted_and_said(tmp_path: Path):
+def test_unsorted_poses_are_sorted_and_reported(tmp_path: Path):
     lines = tum("s").splitlines()
     (tmp_path / "t.txt").write_text("\n".join(lines[::-1]))
     trajectory, notes = read_trajectory(tmp_path / "t.txt")
@@ -66,7 +66,7 @@ def test_mocap_data_of_tum_vie(tmp_path: Path):
     check(read_trajectory(tmp_path / "mocap_data.txt")[0])
 
 
-def test_the_order_that_devo_writes_must_be_told(tmp_path: Path):
+def test_devos_quaternion_order_must_be_given(tmp_path: Path):
     text = rows([f"{float(t)}" for t in T_US], np.hstack([POSITION, QUAT[:, [1, 2, 3, 0]]]))
     (tmp_path / "t.txt").write_text(text)
     with pytest.raises(TrajectoryError, match="expected --quaternion yzwx"):
@@ -85,14 +85,14 @@ def test_the_order_that_devo_writes_must_be_told(tmp_path: Path):
         ("# timestamp tx ty tz qx qy qz qw", [0, 1, 2, 3]),
     ],
 )
-def test_a_header_tells_the_order_of_quaternions(tmp_path: Path, header: str, order: list[int]):
+def test_a_header_gives_the_quaternion_order(tmp_path: Path, header: str, order: list[int]):
     (tmp_path / "t.txt").write_text(
         header + "\n" + rows([str(1000 * t) for t in T_US], np.hstack([POSITION, QUAT[:, order]]))
     )
     check(read_trajectory(tmp_path / "t.txt")[0])
 
 
-def test_a_comment_without_names_does_not_tell_devos_order(tmp_path: Path):
+def test_a_comment_without_names_does_not_give_devos_order(tmp_path: Path):
     text = rows([f"{float(t)}" for t in T_US], np.hstack([POSITION, QUAT[:, [1, 2, 3, 0]]]))
     (tmp_path / "t.txt").write_text("# run 3\n" + text)
     with pytest.raises(TrajectoryError, match="expected --quaternion yzwx"):
@@ -204,10 +204,10 @@ def test_robust_e_nerf(tmp_path: Path):
         ("0 0 0 0 0 0 0 1\n1 0 0\n", "3 columns, expected 8 as before"),
         ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", ":2: time 0 again, expected times that increase"),
         ("0 0 0 0 0 0 0 1\n1e11 0 0 0 0 0 0 1\n", "plausible spacing in no unit"),
-        ("2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, "is no rotation"),
+        ("2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 3, "is not a rotation"),
     ],
 )
-def test_what_is_no_trajectory_is_named(tmp_path: Path, content: str, words: str):
+def test_files_without_a_trajectory_are_named(tmp_path: Path, content: str, words: str):
     (tmp_path / "t.txt").write_text(content)
     with pytest.raises(TrajectoryError) as caught:
         read_trajectory(tmp_path / "t.txt")

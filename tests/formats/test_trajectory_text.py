@@ -1,4 +1,4 @@
-"""Columns by name, first lines with mistakes, times that are equal or in an unknown unit."""
+"""Columns by name, mistakes in the first lines, equal times and unknown time units."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ NS = [str(1000 * t) for t in T_US.tolist()]
 
 
 def table(header: str, *columns: object) -> str:
-    """Comma-separated, below a line of names; a number alone stands for itself in every line."""
+    """Comma-separated rows below a header line; a scalar is repeated in every row."""
     lines = [header]
     for k in range(COUNT):
         cells = []
@@ -68,7 +68,7 @@ NSECS = [str(t % 10**6 * 1000) for t in T_US.tolist()]
         (table("# made today", [*map(str, range(COUNT))], seconds(T_US), POSITION, QUAT), "which counts the lines"),
     ],
 )
-def test_names_tell_where_a_pose_is(tmp_path: Path, text: str, said: str):
+def test_column_names_locate_the_pose(tmp_path: Path, text: str, said: str):
     for name, content, encoding in (
         ("t.csv", text, "utf-8"),
         ("crlf.csv", text.replace("\n", "\r\n"), "utf-8-sig"),
@@ -98,7 +98,7 @@ def test_a_byte_order_mark_costs_no_pose(tmp_path: Path):
 @pytest.mark.parametrize(
     "first", ["0.0OO 0 0 0 0 0 0 1", "nan 0 0 0 0 0 0 1", "O.0 0 0 0 0 0 0 1", "0,0 0 0 0 0 0 0 1", "0"]
 )
-def test_a_first_line_with_a_mistake_is_no_line_of_names(tmp_path: Path, first: str):
+def test_a_first_line_with_a_mistake_is_not_a_header(tmp_path: Path, first: str):
     (tmp_path / "t.txt").write_text("# a comment\n" + first + "\n" + tum("s"))
     with pytest.raises(TrajectoryError, match=r"t\.txt:2: .*expected"):
         read_trajectory(tmp_path / "t.txt")
@@ -139,7 +139,7 @@ def test_milliseconds_are_asked_for_where_another_unit_is_as_plausible(tmp_path:
 
 
 @pytest.mark.parametrize(("unit_us", "step"), [(10**6, 1), (10**6, 5), (1, 200)])
-def test_the_events_tell_seconds_and_microseconds_from_milliseconds(tmp_path: Path, unit_us: int, step: int):
+def test_the_events_distinguish_seconds_and_microseconds_from_milliseconds(tmp_path: Path, unit_us: int, step: int):
     t_us = unit_us * step * np.arange(COUNT)
     (tmp_path / "t.txt").write_text(rows([str(step * k) for k in range(COUNT)], np.hstack([POSITION, QUAT])))
     check(read_trajectory(tmp_path / "t.txt", span_us=(int(t_us[2]), int(t_us[-2])))[0], t_us)
@@ -162,7 +162,7 @@ def test_matrices_as_npy(tmp_path: Path, shape: tuple[int, ...]):
     check(read_trajectory(tmp_path / "timed.npy")[0], T_US - T_US[0])
 
 
-def test_arrays_that_are_no_matrices_are_named(tmp_path: Path):
+def test_arrays_other_than_matrices_are_named(tmp_path: Path):
     square = np.concatenate([matrices(), np.tile([[[0.0, 0, 0, 1]]], (COUNT, 1, 1))], axis=1)
     (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
     known = TrajectoryFormat(pose_times=tmp_path / "times.txt")
@@ -170,7 +170,7 @@ def test_arrays_that_are_no_matrices_are_named(tmp_path: Path):
     lost[4, 0, 3] = np.nan
     for content, words in (
         (square.transpose(0, 2, 1), "the last row of matrix 0 is"),
-        (2 * square[:, :3], "the matrix of pose 0 is no rotation"),
+        (2 * square[:, :3], "the matrix of pose 0 is not a rotation"),
         (lost, "pose 4: a number is not finite"),
         (square[0], r"shape \(4, 4\), expected matrices \(poses, 4, 4\)"),
         (square[:5], "12 times, expected one for each of the 5 poses"),
@@ -180,7 +180,7 @@ def test_arrays_that_are_no_matrices_are_named(tmp_path: Path):
             read_trajectory(tmp_path / "poses.npy", known)
 
 
-def test_numbers_of_frames_are_no_times_where_there_are_times(tmp_path: Path):
+def test_frame_numbers_are_not_times_if_there_are_times(tmp_path: Path):
     lines = "".join(f"{k} {' '.join(map(repr, m.ravel().tolist()))}\n" for k, m in enumerate(matrices()))
     (tmp_path / "poses.txt").write_text(lines)
     (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))

@@ -1,4 +1,4 @@
-"""Recordings in other people's formats, written as the formats' descriptions have them: for tests alone."""
+"""Writers for foreign recording formats, implemented from the format descriptions, for tests only."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -37,7 +37,7 @@ def evt21(events: Sequence[Event], swapped: bool = False) -> bytes:
             words.append((0x8 << 28 | high & 0xFFFFFFF) << 32)
         valid = 1
         k += 1
-        # Neighbours to the right, in order, go into the same word.
+        # Neighbours to the right, in order, share a word.
         while k < len(events) and events[k][0] == t and events[k][2:] == (y, p):
             bit = events[k][1] - x
             if not bit.bit_length() or bit >= 32 or bit < valid.bit_length():
@@ -73,7 +73,7 @@ def evt3(events: Sequence[Event]) -> bytes:
         if len(run) == 1:
             words.append(0x2000 | p << 11 | x)
         else:
-            # Twelve and eight neighbours from the first one on.
+            # Vectors of twelve and eight neighbours, starting at the first one.
             valid = sum(1 << one - x for one in run)
             words += [0x3000 | p << 11 | x, 0x4000 | valid & 0xFFF, 0x5000 | valid >> 12]
         k += len(run)
@@ -145,7 +145,7 @@ def runs(values: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def ecf_file(path: Path, events: Sequence[Event], layouts: Sequence[str], chunk: int = 100) -> Path:
-    """An HDF5 file as Metavision writes it, its chunks in these layouts by turns, or "as they are"."""
+    """An HDF5 file as Metavision writes it, with chunks cycling through these layouts, or "as they are"."""
     event = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
     settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     settings.set_chunk((chunk,))

@@ -32,7 +32,7 @@ def orbit(ahead_us: int = 0, count: int = 60) -> Trajectory:
 
 
 def corrected(path: Trajectory, offset_us: int, error_rad: float, seed: int, width: float = 5.0) -> Trajectory:
-    """Where keyframes of a clock that is off belong, but for smooth errors of a correction."""
+    """Corrected keyframes for a clock offset, with smooth errors of the correction."""
     inside = interpolate(path.t_us, path.poses, path.t_us - offset_us, "cubic")
     random = np.random.default_rng(seed)
     turn = quat_wxyz_exp(smooth_noise(random, len(path.t_us), error_rad, width))
@@ -49,8 +49,8 @@ def test_an_offset_is_found_to_a_millisecond(offset_us: int):
 
 
 @pytest.mark.parametrize("error_rad, width", [(1e-9, 2.0), (1e-3, 0.1), (0.05, 2.0), (0.05, 10.0)])
-def test_errors_that_are_no_offset_are_taken_for_none(error_rad: float, width: float):
-    """Of 4 hand-held trajectories that drift, none is given another clock."""
+def test_other_errors_are_not_mistaken_for_an_offset(error_rad: float, width: float):
+    """None of 4 drifting handheld trajectories gets a clock offset."""
     wrong = []
     for seed in range(4):
         path = hand_held(seed)
@@ -60,13 +60,13 @@ def test_errors_that_are_no_offset_are_taken_for_none(error_rad: float, width: f
     assert not wrong
 
 
-def test_uniform_motion_tells_no_offset():
+def test_uniform_motion_gives_no_offset():
     path = orbit()
     found = clock_offset(path, corrected(orbit(30_000), 0, 1e-4, 0), kind="cubic")
     assert not found.certain or found.moved_rad < 3e-4
 
 
-def test_a_still_camera_tells_no_offset():
+def test_a_static_camera_gives_no_offset():
     still = Trajectory(
         torch.arange(10) * EVERY_US,
         Poses(torch.zeros(10, 3, dtype=torch.float64), torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(10, 4)),
@@ -75,6 +75,6 @@ def test_a_still_camera_tells_no_offset():
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-def test_few_keyframes_tell_no_offset(count: int):
+def test_few_keyframes_give_no_offset(count: int):
     path = hand_held(3, count)
     assert not clock_offset(path, corrected(path, 0, 0.01, 4)).certain

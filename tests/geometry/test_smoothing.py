@@ -41,7 +41,7 @@ def test_true_poses_stay_where_they_are():
     assert position < 1e-3 and angle < 1e-3
 
 
-def test_among_few_keyframes_noise_is_seldom_followed():
+def test_few_keyframes_are_rarely_overfitted():
     t_us = torch.arange(17) * 10_000
     still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(17, 1)
     line = Trajectory(t_us, Poses(torch.linspace(0, 0.05, 17, dtype=torch.float64)[:, None] * torch.eye(3)[0], still))
@@ -50,7 +50,7 @@ def test_among_few_keyframes_noise_is_seldom_followed():
         noise = 0.01 * torch.from_numpy(np.random.default_rng(seed).standard_normal((17, 3)))
         noisy = Trajectory(t_us, Poses(line.poses.position + noise, still))
         left.append(errors(smoothed(noisy), line)[0] / errors(noisy, line)[0])
-    # A straight line fitted would leave the root of 2 / 17: 0.34.
+    # A fitted straight line would leave sqrt(2 / 17) = 0.34.
     assert np.median(left) < 0.4 and np.quantile(left, 0.9) < 0.55
 
 

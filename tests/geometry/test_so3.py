@@ -1,4 +1,4 @@
-"""Rotations against scipy; where formulas divide by zero, see tests/stability."""
+"""Rotations against scipy; singularities are tested in tests/stability."""
 
 import torch
 from hypothesis import given

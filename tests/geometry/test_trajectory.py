@@ -28,7 +28,7 @@ def keyframes(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> 
 def parabolic_at_the_ends(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """A cubic spline whose second derivative is constant in the first and the last interval."""
     if len(knots) < 4:
-        # Two points have a line, three a parabola.
+        # Two points define a line, three a parabola.
         return BarycentricInterpolator(knots, values)(at)
     flat = [(3, np.zeros(values.shape[1]))]
     return make_interp_spline(knots, values, k=3, bc_type=(flat, flat))(at)
@@ -51,7 +51,7 @@ def test_agrees_with_scipy(seed: int, count: int, kind: str):
 
 
 def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, float]:
-    """Largest error [m, rad] of a motion that turns and goes to and fro, under way when it begins and when it ends."""
+    """Largest error [m, rad] for a rotating, oscillating motion that is under way at both ends."""
 
     def motion(t_us: np.ndarray) -> tuple[np.ndarray, Rotation]:
         t = t_us[:, None] * 1e-6
@@ -69,12 +69,12 @@ def errors_between_keyframes(kind: str, keyframes_per_s: int) -> tuple[float, fl
     return float(np.abs(found.position.numpy() - true_position).max()), float(off_rad.max())
 
 
-def test_a_spline_follows_a_smooth_motion_that_lines_cut_short():
+def test_a_spline_follows_smooth_motion_better_than_lines():
     lines, splines, finer = (
         np.array(errors_between_keyframes(*what)) for what in (("linear", 20), ("cubic", 20), ("cubic", 40))
     )
     assert (splines < 0.1 * lines).all()
-    # At the ends, and for rotations, whose frames turn, the error goes with the third power of the spacing.
+    # At the ends, and for rotations, whose frames rotate, the error is cubic in the spacing.
     assert (splines / finer > 6).all()
 
 
@@ -137,7 +137,7 @@ def test_a_delay_is_an_earlier_time_and_has_its_gradient(kind: Interpolation):
 
 
 @given(st.integers(0, 50), st.integers(2, 9), st.integers(1, 100_000), st.sampled_from(["linear", "cubic"]))
-def test_poses_are_inserted_on_the_path_and_those_given_stay(seed: int, count: int, gap_us: int, kind: Interpolation):
+def test_poses_are_inserted_on_the_path_and_given_ones_stay(seed: int, count: int, gap_us: int, kind: Interpolation):
     t_us, poses = keyframes(count, seed)
     dense, given_at = densified(Trajectory(t_us, poses), gap_us + 500, kind)
     assert int(dense.t_us.diff().min()) > 0 and int(dense.t_us.diff().max()) <= gap_us + 501
@@ -148,7 +148,7 @@ def test_poses_are_inserted_on_the_path_and_those_given_stay(seed: int, count: i
     assert torch.allclose(dense.poses.position, between.position, atol=1e-12)
 
 
-def test_no_pose_is_inserted_where_none_is_asked_for():
+def test_no_pose_is_inserted_by_default():
     t_us, poses = keyframes(5)
     for gap_us in (0, 10**9):
         dense, given_at = densified(Trajectory(t_us, poses), gap_us, "linear")

@@ -41,7 +41,7 @@ def test_written_poses_read_back(tmp_path_factory: pytest.TempPathFactory, times
     assert torch.allclose(back.poses.quat_wxyz, poses.quat_wxyz, atol=1e-8)
 
 
-def test_negative_times_are_written_right():
+def test_negative_times_are_written_correctly():
     assert format_seconds(-1_500_000) == "-1.500000" and format_seconds(-5) == "-0.000005"
 
 

@@ -1,4 +1,4 @@
-"""Torn trajectories are named, and those that go on are not, however they move."""
+"""Discontinuous trajectories are reported; continuous ones are not, however they move."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_two_sessions_in_one_are_named(step_us: int):
     assert "two sessions in one trajectory?" in said and "between keyframes 0 and 1" in said
 
 
-def test_motion_that_goes_on_is_not_suspected():
+def test_continuous_motion_is_not_suspected():
     rng = np.random.default_rng(0)
     t_us = 20_000 * np.arange(100)
     rest_then_run = path(t_us) / (1 + np.exp((1.0 - t_us[:, None] * 1e-6) * 10))

@@ -26,7 +26,7 @@ def test_a_level_counts_by_its_share():
     assert torch.equal(grid(point), whole * torch.tensor([1, 1, 0.5, 0.5, 0, 0]))
 
 
-def test_without_the_time_for_it_nothing_moves(tiny_scene: Path, tmp_path: Path):
+def test_without_enough_time_nothing_moves(tiny_scene: Path, tmp_path: Path):
     ready = trainer(config(tiny_scene, tmp_path / "run"))
     before = ready.pipeline.trajectory()
     assert align(ready.pipeline.model, ready.pipeline.datamanager, 1000, 0, most_seconds=1e-3) is None
@@ -34,7 +34,7 @@ def test_without_the_time_for_it_nothing_moves(tiny_scene: Path, tmp_path: Path)
 
 
 def ready_trainer(folder: Path, errors: TrajectoryErrors, duration_s: float = 1.5) -> tuple[EbarfTrainer, Path]:
-    """A trainer of a small room that has not aligned anything yet."""
+    """A trainer for a small room, before alignment."""
     made = Simulation(
         width=80, height=60, focal_px=70.0, duration_s=duration_s, frames=1, rays_per_pixel=4, errors=errors
     )
@@ -63,7 +63,7 @@ def test_a_large_drift_is_found_and_a_good_trajectory_left_alone(tmp_path: Path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("offset_us", [0, 60_000])
-def test_the_clock_is_set_where_it_was_off(tmp_path: Path, offset_us: int):
+def test_a_clock_offset_is_corrected(tmp_path: Path, offset_us: int):
     ready, scene = ready_trainer(tmp_path, replace(NO_ERRORS, clock_offset_us=offset_us), duration_s=2.0)
     alignment = align(ready.pipeline.model, ready.pipeline.datamanager, 400, 0)
     assert alignment and abs(alignment.clock_offset_us + offset_us) <= (10_000 if offset_us else 0)
@@ -74,7 +74,7 @@ def test_the_clock_is_set_where_it_was_off(tmp_path: Path, offset_us: int):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spoilt", [False, True])
-def test_held_out_events_tell_a_spoilt_trajectory_from_a_good_one(tmp_path: Path, spoilt: bool):
+def test_held_out_events_distinguish_a_spoilt_trajectory_from_a_good_one(tmp_path: Path, spoilt: bool):
     ready, _ = ready_trainer(tmp_path, NO_ERRORS)
     keyframes = ready.pipeline.model.camera_optimizer
     course = torch.linspace(0, 9, len(keyframes.keyframe_t_us)).sin()

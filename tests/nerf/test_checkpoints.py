@@ -5,7 +5,9 @@ import os
 import shutil
 import signal
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -36,6 +38,12 @@ def test_the_last_two_are_kept_and_are_what_was_written(tmp_path: Path):
     found = read_checkpoint(step_path(tmp_path, 100))
     assert unsealed(found["pipeline"], "it")["table"].equal(some_state(100, 100)["pipeline"]["table"])
     assert found["optimizers"] is not None and newest_whole(folder) == (step_path(tmp_path, 100), [])
+
+
+def test_what_a_training_left_behind_that_goes_on_from_before_it_goes(tmp_path: Path):
+    for step in (5, 20, 100, 50):
+        write_checkpoint(some_state(step, step), step_path(tmp_path, step))
+    assert sorted(step_path(tmp_path, 0).parent.iterdir()) == [step_path(tmp_path, 20), step_path(tmp_path, 50)]
 
 
 def test_a_flipped_bit_is_noticed_wherever_it_matters_and_the_checkpoint_before_is_taken(tmp_path: Path):
@@ -123,6 +131,8 @@ def test_a_folder_has_one_writer_and_loses_what_a_killed_one_left_half_written(t
     first.release()
     write_checkpoint(some_state(1), step_path(tmp_path, 1))
     (tmp_path / ".step-000000009.a1b2c3_d.ckpt").write_text("half")
+    (tmp_path / "step-000000009.ckpt").write_text("not yet in its folder")
+    (tmp_path / ".scene.a1b2c3_d").mkdir()
     (tmp_path / "config.yml").write_text("kept")
     with pytest.raises(TrainingError, match="holds a run, up to step-000000001.ckpt"):
         take_folder(tmp_path, goes_on=False, overwrite=False)
@@ -132,19 +142,60 @@ def test_a_folder_has_one_writer_and_loses_what_a_killed_one_left_half_written(t
     assert not list(step_path(tmp_path, 1).parent.iterdir())
 
 
+@pytest.mark.parametrize("phase", ["plan", "compile", "alignment", "evaluation", "saving", "report"])
+def test_a_signal_in_any_phase_ends_a_run_in_order(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
+):
+    from ebarf_ns.nerf import trainer as room
+
+    def interrupted(place: object, name: str) -> None:
+        done = getattr(place, name)
+
+        def then(*of: Any, **named: Any) -> Any:
+            monkeypatch.setattr(place, name, done)
+            os.kill(os.getpid(), signal.SIGTERM)
+            return done(*of, **named)
+
+        monkeypatch.setattr(place, name, then)
+
+    place, name = {
+        "plan": (room, "plan_run"),
+        "compile": (room.EbarfPipeline, "get_train_loss_dict"),
+        "alignment": (room, "align"),
+        "evaluation": (room.EbarfPipeline, "evaluate"),
+        "saving": (room, "write_checkpoint"),
+        "report": (room, "write_report"),
+    }[phase]
+    interrupted(place, name)
+    made = config(tiny_scene, tmp_path, steps=30)
+    made.pipeline.model.camera_optimizer.align_steps = 10  # pyright: ignore[reportAttributeAccessIssue]
+    handlers = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(SystemExit) as stopped:
+        trainer(made).train()
+    assert stopped.value.code == 143
+    assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == handlers
+    checkpoints = sorted(made.get_checkpoint_dir().glob("step-*.ckpt"))
+    assert bool(checkpoints) == (phase not in ("plan", "alignment"))
+    monkeypatch.undo()
+    again = config(tiny_scene, tmp_path, steps=31)
+    again.load_dir = made.get_checkpoint_dir() if checkpoints else None
+    trainer(again).train()
+    assert json.loads((tmp_path / "x/ebarf/run/metrics.jsonl").read_text().splitlines()[-1])["step"] == 31
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_run_whole(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: int
 ):
     ready = trainer(config(tiny_scene, tmp_path, steps=1000))
-    step_done = type(ready)._average
+    step_done = ready.averaging.follow
 
-    def interrupted(training) -> None:
-        step_done(training)
-        if training.steps_done == 3:
+    def interrupted(steps_done: int) -> None:
+        step_done(steps_done)
+        if steps_done == 3:
             os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(type(ready), "_average", interrupted)
+    monkeypatch.setattr(ready.averaging, "follow", interrupted)
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as stopped:
         ready.train()
@@ -181,13 +232,54 @@ def test_a_run_knows_its_scene(tiny_scene: Path, tmp_path: Path, capsys: pytest.
     assert headers[0]["scene_digest"] == headers[1]["scene_digest"] and len(headers[0]["scene_digest"]) == 3
 
 
+def test_a_script_that_opens_a_run_takes_the_newest_whole_checkpoint_and_says_what_changed(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    made = config(scene, tmp_path, steps=4)
+    made.steps_per_save = 2
+    ready = trainer(made)
+    ready.train()
+    older, newest = sorted(ready.checkpoint_dir.iterdir())
+    content = bytearray(newest.read_bytes())
+    content[len(content) // 2] ^= 1
+    newest.write_bytes(content)
+    with h5py.File(scene / "events.h5", "r+") as file:
+        file["events/p"][:10] = 1 - file["events/p"][:10]  # pyright: ignore
+    _, pipeline, path, step = eval_setup(ready.base_dir / "config.yml", test_mode="test")
+    assert path == older and step == 2
+    found = capsys.readouterr()
+    assert f"{newest.name}:isdamaged" in "".join(found.out.split())
+    assert f"{scene}: recording changed since" in found.err
+    older.write_bytes(b"")
+    with pytest.raises(SystemExit) as stopped:
+        eval_setup(ready.base_dir / "config.yml", test_mode="test")
+    assert stopped.value.code == 2 and newest.name in capsys.readouterr().err
+
+
+def test_a_second_training_leaves_the_first_ones_folder_as_it_is(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    first = trainer(config(tiny_scene, tmp_path, steps=3))
+    before = {path: path.read_bytes() for path in first.base_dir.rglob("*") if path.is_file()}
+    second = config(tiny_scene, tmp_path, steps=3)
+    second.save_config()
+    with pytest.raises(SystemExit) as stopped:
+        trainer(second)
+    assert stopped.value.code == 2 and "another training writes there" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in first.base_dir.rglob("*") if path.is_file()} == before
+    first.train()
+
+
 def test_a_parameter_that_is_not_finite_is_never_saved(tiny_scene: Path, tmp_path: Path):
     ready = trainer(config(tiny_scene, tmp_path, steps=2))
     ready.train()
     before = {path: path.read_bytes() for path in ready.checkpoint_dir.iterdir()}
     ready.steps_done = 3
     with torch.no_grad():
-        ready._parameters()[0].view(-1)[0] = torch.nan
-    ready.mean = None
+        ready.averaging.parameters[0].view(-1)[0] = torch.nan
+    ready.averaging.mean = None
     ready.save_checkpoint(2)
     assert {path: path.read_bytes() for path in ready.checkpoint_dir.iterdir()} == before

@@ -15,7 +15,7 @@ EVERY_PIXEL = torch.arange(32 * 24)
 
 
 @pytest.mark.parametrize("model", CAMERAS)
-def test_untouched_they_are_those_given(model: str):
+def test_initial_intrinsics_are_the_given_ones(model: str):
     camera = CAMERAS[model]
     fresh = Intrinsics(camera)
     given = camera.bearings(camera.pixel_grid()).flatten(0, 1).float()

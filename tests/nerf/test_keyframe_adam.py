@@ -7,7 +7,7 @@ from ebarf_ns.nerf.keyframe_adam import KeyframeAdam
 
 
 def descend(optimizer: torch.optim.Optimizer, rows: torch.Tensor, stiffness: torch.Tensor, steps: int) -> float:
-    """Noisy gradients of a quadratic bowl that is steep along some directions and flat along others."""
+    """Noisy gradients of an ill-conditioned quadratic bowl."""
     generator = torch.Generator().manual_seed(0)
     root = torch.linalg.cholesky(stiffness)
     for _ in range(steps):
@@ -31,10 +31,10 @@ def test_without_stretches_for_rows_of_one_number_it_is_adam():
     assert torch.allclose(ours, theirs, atol=1e-5)
 
 
-def test_not_coupled_no_number_knows_of_the_others():
+def test_without_coupling_parameters_are_independent():
     gradients = torch.randn(20, 3, 6, generator=torch.Generator().manual_seed(2))
     rows, alone = rows_of(torch.zeros(3, 6)), rows_of(torch.zeros(18, 1))
-    # Without eps, which is a share of the mean over all six.
+    # With eps = 0, since it is a share of the mean over all six.
     one = KeyframeAdam([rows], eps=0.0, coupled=False, stretches=False)
     other = KeyframeAdam([alone], eps=0.0, stretches=False)
     for gradient in gradients:
@@ -44,8 +44,8 @@ def test_not_coupled_no_number_knows_of_the_others():
     assert torch.allclose(rows.reshape(18, 1), alone, atol=1e-5)
 
 
-def test_a_soft_direction_among_stiff_ones_is_followed_sooner_than_by_adam():
-    # The sum of the two is told a thousand times better than their difference.
+def test_a_soft_direction_is_followed_faster_than_by_adam():
+    # The sum of the two is constrained a thousand times better than their difference.
     stiffness = torch.tensor([[1.0, 0.999], [0.999, 1.0]])
     start = torch.tensor([[1.0, -1.0]])
     way = {}
@@ -56,8 +56,8 @@ def test_a_soft_direction_among_stiff_ones_is_followed_sooner_than_by_adam():
 
 
 @pytest.mark.parametrize("count", [40, 41])
-def test_a_bend_of_the_whole_is_followed_beneath_the_noise_of_each_row(count: int):
-    # Each row's gradient is ten times noisier than the bend is strong.
+def test_a_bend_of_the_trajectory_is_followed_below_the_noise_of_each_row(count: int):
+    # The noise of each row's gradient is ten times the bend.
     bend = 0.1 * torch.linspace(-1, 1, count)[:, None].expand(-1, 6)
     gained = {}
     for stretches in (True, False):
@@ -72,7 +72,7 @@ def test_a_bend_of_the_whole_is_followed_beneath_the_noise_of_each_row(count: in
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 41])
-def test_what_all_rows_say_moves_all_of_them_alike(count: int):
+def test_a_common_gradient_moves_all_rows_alike(count: int):
     rows = rows_of(torch.zeros(count, 6))
     optimizer = KeyframeAdam([rows], lr=0.1)
     gradient = torch.randn(1, 6, generator=torch.Generator().manual_seed(3))
@@ -126,7 +126,7 @@ def test_the_size_of_the_loss_does_not_matter(size: float, count: int):
 
 
 @pytest.mark.parametrize("count", [3, 10])
-def test_its_state_goes_on_as_if_never_stopped(count: int):
+def test_its_state_resumes_exactly(count: int):
     gradients = torch.randn(8, count, 6, generator=torch.Generator().manual_seed(2))
     whole, stopped = rows_of(torch.zeros(count, 6)), rows_of(torch.zeros(count, 6))
     one, other = KeyframeAdam([whole]), KeyframeAdam([stopped])

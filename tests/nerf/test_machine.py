@@ -34,7 +34,7 @@ def test_torch_and_numba_follow(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.undo()
     before = torch.get_num_threads(), numba.get_num_threads()
     try:
-        use_threads(Threads(1, ""))
+        use_threads(1)
         assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
     finally:
         torch.set_num_threads(before[0])

@@ -52,7 +52,7 @@ def test_the_live_line_stays_one_line(monkeypatch: pytest.MonkeyPatch):
     console = Console(file=StringIO(), force_terminal=True, width=100)
     monkeypatch.setattr(terminal, "CONSOLE", console)
     live = LiveLine()
-    live.start()
+    live.__enter__()
     live.update(0.25, 640, 15.0, 0.024, 0.123)
     live._progress.refresh()
     shown = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
@@ -69,7 +69,7 @@ def test_nobody_looks_and_nothing_is_written(monkeypatch: pytest.MonkeyPatch):
     console = Console(file=StringIO(), force_terminal=False, width=100)
     monkeypatch.setattr(terminal, "CONSOLE", console)
     live = LiveLine()
-    live.start()
+    live.__enter__()
     live.update(0.25, 640, 15.0, 0.024, 0.123)
     live.stop()
     assert console.file.getvalue().strip() == ""  # pyright: ignore[reportAttributeAccessIssue]

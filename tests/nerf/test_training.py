@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from ebarf_ns.errors import TrainingError
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf import method
-from ebarf_ns.nerf.optimizers import FusedAdamConfig, GuardedOptimizers
+from ebarf_ns.nerf.guard import GuardedOptimizers
+from ebarf_ns.nerf.optimizers import FusedAdamConfig
 from ebarf_ns.nerf.trainer import EbarfTrainer, EbarfTrainerConfig
 from ebarf_ns.simulation.sensor import SensorModel
 from ebarf_ns.simulation.simulate import Simulation, simulate
@@ -293,7 +295,7 @@ def test_the_fast_paths_train_as_the_torch_reference_does(
     for name in ("kernels", "reference"):
         ready = trainer(config(tiny_scene, tmp_path / name, steps=60))
         if name == "reference":
-            ready.pipeline.model.renderer.field.grid.carrier = "torch"
+            ready.pipeline.model.renderer.field.grid.backend = "torch"
             monkeypatch.setattr(ray_sampling_numba, "importance_edges", ray_sampling.importance_edges)
         ready.train()
         ends.append(ready.pipeline.evaluate())
@@ -389,6 +391,7 @@ def test_what_cannot_be_gone_on_from_ends_in_one_line(
     assert stopped.value.code == 2 and said.count("\n") == 1
     if what == "of other flags":
         assert f"{path.name}: cannot go on from it" in said and "with the flags it was made by" in said
+        assert "by: --pipeline.model.grid-features 4 (now 2)" in said
     else:
         assert f"{path.name}: is damaged, or no checkpoint" in said
 
@@ -413,6 +416,46 @@ def test_a_gradient_beyond_reason_is_skipped_unless_it_stays_so():
     after = optimizers.optimizers["x"].state[parameter]
     assert after["step"] == moments["step"] + 2 and float(after["exp_avg_sq"].max()) < 5
     assert [step(1e6) for _ in range(4)] == [1, 1, 0, 0]
+
+
+def test_one_percent_of_the_last_thousand_steps_may_be_skipped_and_no_more():
+    parameter = torch.nn.Parameter(torch.zeros(5))
+    optimizers = GuardedOptimizers(
+        {"x": {"optimizer": FusedAdamConfig(lr=0.01), "scheduler": None}}, {"x": [parameter]}
+    )
+    scaler = torch.amp.GradScaler(enabled=False)
+
+    def step(size: float) -> None:
+        parameter.grad = torch.full((5,), size)
+        optimizers.optimizer_scaler_step_some(scaler, ["x"])
+
+    for _ in range(30):
+        for number in range(100):
+            step(torch.nan if number == 50 else 1.0)
+    assert optimizers.skipped == 30
+    again = GuardedOptimizers({"x": {"optimizer": FusedAdamConfig(lr=0.01), "scheduler": None}}, {"x": [parameter]})
+    again.load_guard_state(optimizers.guard_state())
+    optimizers = again
+    with pytest.raises(TrainingError, match="11 of the last 1000 steps had gradients that are not finite"):
+        step(torch.nan)
+
+
+def test_a_parameter_that_is_not_finite_is_found_wherever_it_is():
+    small, large = torch.nn.Parameter(torch.zeros(5)), torch.nn.Parameter(torch.zeros(300, 700))
+    optimizers = GuardedOptimizers(
+        {"x": {"optimizer": FusedAdamConfig(lr=0.01), "scheduler": None}}, {"x": [small, large]}
+    )
+    for step in range(100):
+        optimizers.check_parameters(step)
+    with torch.no_grad():
+        large[123, 456] = torch.nan
+    with pytest.raises(TrainingError, match="no longer finite"):
+        for step in range(64):
+            optimizers.check_parameters(step)
+    with torch.no_grad():
+        large[123, 456], small[0] = 0.0, torch.inf
+    with pytest.raises(TrainingError, match="no longer finite"):
+        optimizers.check_parameters(0)
 
 
 def test_a_step_in_which_no_group_is_due_is_not_a_broken_one():

@@ -27,6 +27,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
 
 PATIENCE_S = 240
+NO_ALIGNMENT = "--pipeline.model.camera-optimizer.align-steps=0"
 BLUE, ORANGE, GREEN = (31, 119, 180), (255, 127, 14), (44, 160, 44)
 # viser's own page asks for a script that counts visits, and draws a gizmo before it has a size.
 VISERS_REQUEST = re.compile(r"https://www\.googletagmanager\.com/.*")
@@ -86,6 +87,10 @@ def opened(*command: object) -> Iterator[Visit]:
             visit.page.set_default_timeout(1000 * PATIENCE_S)
             visit.page.goto(f"http://127.0.0.1:{port}")
             visit.page.get_by_text("Event camera").wait_for()
+            # A page opened while nerfstudio was still building its own has asked for its logo.
+            visit.outside.clear()
+            visit.page.reload()
+            visit.page.get_by_text("Event camera").wait_for()
             wait_until(lambda: len(visit.pictures()) == 2)
             yield visit
             browser.close()
@@ -108,8 +113,8 @@ def pixels_of(picture: np.ndarray, color: tuple[int, int, int]) -> int:
 def test_a_finished_run(trained_run: Path, tmp_path: Path):
     with opened("ns-viewer", "--load-config", trained_run / "config.yml") as visit:
         wait_until(lambda: visit.picture("finished").std() > 20)
-        seen = visit.picture("finished")
-        assert all(pixels_of(seen, color) > 30 for color in (BLUE, ORANGE, GREEN))
+        visit.page.get_by_text("See all keyframes").click()
+        wait_until(lambda: all(pixels_of(visit.picture("all"), color) > 30 for color in (BLUE, ORANGE, GREEN)))
 
         for label, color in (("initial, blue", BLUE), ("reference, green", GREEN)):
             before = pixels_of(visit.picture("before"), color)
@@ -117,6 +122,7 @@ def test_a_finished_run(trained_run: Path, tmp_path: Path):
             wait_until(lambda before=before, color=color: pixels_of(visit.picture("hidden"), color) < before / 3)
             visit.tick(label)
 
+        visit.page.get_by_text("Fly to keyframe").click()
         before, place = visit.pictures()[0], visit.picture("middle")
         slider = visit.page.get_by_text("time [s]").locator("xpath=ancestor::*[.//input[@type='text']][1]")
         slider.locator("input[type='text']").fill("0.05")
@@ -130,7 +136,6 @@ def test_a_finished_run(trained_run: Path, tmp_path: Path):
         saved, on_disk = read_tum(tmp_path / "saved.txt"), read_tum(trained_run / "trajectory_refined.txt")
         assert all(np.array_equal(*pair) for pair in zip(saved.poses, on_disk.poses, strict=True))
 
-        visit.page.get_by_text("Fly to keyframe").click()
         assert not visit.errors
         assert all(VISERS_REQUEST.fullmatch(url) for url in visit.outside)
 
@@ -138,7 +143,7 @@ def test_a_finished_run(trained_run: Path, tmp_path: Path):
 def test_a_running_training(tiny_scene: Path, tmp_path: Path):
     steps = [flag for flag in TINY_TRAINING if not flag.startswith("--max-num")]
     command = ["ns-train", "ebarf", "--data", tiny_scene, "--output-dir", tmp_path, "--timestamp=run", "--vis=viewer"]
-    with opened(*command, *steps, "--max-num-iterations=100000", "--evaluations=0") as visit:
+    with opened(*command, *steps, "--max-num-iterations=100000", "--evaluations=0", NO_ALIGNMENT) as visit:
         opened_s = time.monotonic()
         wait_until(lambda: visit.picture("training").std() > 20)
         assert time.monotonic() - opened_s < 60

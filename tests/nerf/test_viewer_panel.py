@@ -55,7 +55,7 @@ def client(training: EbarfTrainer) -> Iterator[ViewerClient]:
 
 
 def test_nothing_is_read_or_drawn_before_somebody_looks(training: EbarfTrainer):
-    panel = training.pipeline.viewer_panel
+    panel: Any = training.pipeline.viewer_panel
     started = time.perf_counter()
     for step in range(1000):
         panel.after_step(step)
@@ -64,7 +64,7 @@ def test_nothing_is_read_or_drawn_before_somebody_looks(training: EbarfTrainer):
 
 
 def test_of_a_thousand_keyframes_512_are_drawn_from_the_first_to_the_last():
-    given = torch.ones(1000, dtype=torch.bool)
+    given = torch.arange(1000)
     pipeline: Any = SimpleNamespace(model=SimpleNamespace(camera_optimizer=SimpleNamespace(given=given)))
     server: Any = None
     for most, count in ((-1, 512), (2000, 512), (100, 100)):

@@ -20,7 +20,7 @@ def test_contraction_keeps_the_inside_and_squeezes_the_rest():
 @pytest.mark.parametrize("bounded", [True, False])
 @pytest.mark.parametrize("view_dependent", [True, False])
 @pytest.mark.parametrize("intensity_range", ["unit", "positive"])
-def test_density_and_intensity_are_what_they_must_be(bounded: bool, view_dependent: bool, intensity_range: str):
+def test_density_and_intensity_are_in_range(bounded: bool, view_dependent: bool, intensity_range: str):
     torch.manual_seed(0)
     field = RadianceField(SHAPE, bounded, view_dependent, intensity_range)  # pyright: ignore[reportArgumentType]
     torch.nn.init.normal_(field.grid.table)
@@ -36,7 +36,7 @@ def test_density_and_intensity_are_what_they_must_be(bounded: bool, view_depende
     assert torch.equal(turned, density)
 
 
-def test_view_dependence_changes_intensity_alone():
+def test_view_dependence_changes_only_intensity():
     torch.manual_seed(0)
     field = RadianceField(SHAPE, bounded=True, view_dependent=True)
     point = torch.rand(10, 3)
@@ -52,7 +52,7 @@ def test_huge_raw_density_stays_finite():
     assert torch.isfinite(density).all()
 
 
-def test_half_precision_products_change_answers_and_gradients_by_little():
+def test_bfloat16_changes_values_and_gradients_little():
     torch.manual_seed(0)
     field = RadianceField(SHAPE, bounded=True)
     torch.nn.init.normal_(field.grid.table)
@@ -64,13 +64,13 @@ def test_half_precision_products_change_answers_and_gradients_by_little():
         assert density.dtype == intensity.dtype == torch.float32
         (gradient,) = torch.autograd.grad((density + intensity).sum(), point)
         found[precision] = density.log(), intensity.log(), gradient
-    # Eight bits of mantissa, through four products and for gradients back through four more.
+    # Eight bits of mantissa, through four products and, for gradients, four more.
     for exact, rounded, tolerance in zip(*found.values(), (0.02, 0.02, 0.05), strict=True):
         assert not torch.equal(exact, rounded)
         assert (exact - rounded).norm() < tolerance * exact.norm()
 
 
-def test_pieces_that_stay_in_cache_add_up_to_the_whole(monkeypatch: pytest.MonkeyPatch):
+def test_chunks_give_the_same_result_as_the_whole(monkeypatch: pytest.MonkeyPatch):
     torch.manual_seed(0)
     field = RadianceField(SHAPE, bounded=True, view_dependent=True)
     point, direction = torch.rand(1000, 3), torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
@@ -81,7 +81,7 @@ def test_pieces_that_stay_in_cache_add_up_to_the_whole(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("cells", [1, 2, 3, 16])
-def test_each_lattice_of_brightness_at_large_is_heard_everywhere_between_its_nodes(cells: int):
+def test_each_low_frequency_lattice_contributes_between_its_nodes(cells: int):
     torch.manual_seed(0)
     broad, point = BroadBrightness(cells), torch.rand(1000, 3, requires_grad=True)
     lattices = [*broad.coarser, broad.finest.table]
@@ -95,7 +95,7 @@ def test_each_lattice_of_brightness_at_large_is_heard_everywhere_between_its_nod
     assert point.grad is None and all(lattice.grad is not None for lattice in lattices)
 
 
-def test_brightness_at_large_leaves_density_alone():
+def test_low_frequency_brightness_does_not_affect_density():
     field, point = RadianceField(SHAPE, bounded=False, broad_cells=4), torch.randn(100, 3)
     density, intensity = field(point, None)
     assert field.broad is not None

@@ -1,4 +1,4 @@
-"""Every carrier of the encoding against the torch reference in float64, values and both gradients."""
+"""Every backend of the encoding against the torch reference in float64: values and both gradients."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from ebarf_ns.radiance.hash_grid import Carrier, HashGrid, encode_reference, fastest_carrier
+from ebarf_ns.radiance.hash_grid import Backend, HashGrid, encode_reference, fastest_backend
 from ebarf_ns.radiance.lattice import HashGridShape
 
 SHAPES = [
@@ -18,7 +18,7 @@ SHAPES = [
     HashGridShape(levels=1, features=1, coarsest=5, finest=5, table_size_log2=7),
 ]
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-CARRIERS = ["triton"] if INTERPRETED else ["numba"]
+BACKENDS = ["triton"] if INTERPRETED else ["numba"]
 
 
 def random_points(count: int) -> torch.Tensor:
@@ -26,20 +26,20 @@ def random_points(count: int) -> torch.Tensor:
 
 
 def special_points() -> torch.Tensor:
-    """Corners, faces, cell borders, and outside the cube."""
+    """Points at corners, on faces and cell borders, and outside the cube."""
     steps = torch.tensor([-0.5, 0.0, 0.25, 0.5, 1.0, 1.5])
     return torch.cartesian_prod(steps, steps, steps)
 
 
-def made(shape: HashGridShape, carrier: Carrier | None = None, seed: int = 1) -> HashGrid:
+def made(shape: HashGridShape, backend: Backend | None = None, seed: int = 1) -> HashGrid:
     torch.manual_seed(seed)
-    grid = HashGrid(shape, carrier)
+    grid = HashGrid(shape, backend)
     nn.init.normal_(grid.table)
     return grid
 
 
 def both(grid: HashGrid, point: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """Values, table gradient and position gradient: of the grid, and of the reference in float64."""
+    """Values, table gradient and position gradient of the grid, and of the reference in float64."""
     torch.manual_seed(2)
     weight = torch.randn(len(point), grid.shape.width)
     poison(len(point), grid.shape.width)
@@ -54,27 +54,27 @@ def both(grid: HashGrid, point: torch.Tensor) -> tuple[list[torch.Tensor], list[
 
 
 def poison(*shape: int) -> None:
-    """Leave memory full of NaN where the next arrays are likely to be placed: what is not written shows."""
+    """Fill freed memory with NaN where the next arrays are likely to be placed, to reveal unwritten values."""
     for _ in range(3):
         torch.full(shape, torch.nan)
 
 
-@pytest.mark.parametrize("carrier", CARRIERS)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
-def test_values_and_gradients_agree_with_the_reference(carrier: Carrier, shape: HashGridShape):
-    for ours, theirs in zip(*both(made(shape, carrier), random_points(2000)), strict=True):
+def test_values_and_gradients_agree_with_the_reference(backend: Backend, shape: HashGridShape):
+    for ours, theirs in zip(*both(made(shape, backend), random_points(2000)), strict=True):
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
 
-@pytest.mark.parametrize("carrier", CARRIERS)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
-def test_values_and_table_gradients_agree_on_borders_and_outside(carrier: Carrier, shape: HashGridShape):
-    # Position gradients jump on cell borders, where either side's is right.
-    for ours, theirs in list(zip(*both(made(shape, carrier), special_points()), strict=True))[:2]:
+def test_values_and_table_gradients_agree_on_borders_and_outside(backend: Backend, shape: HashGridShape):
+    # Position gradients are discontinuous at cell borders, where either side is right.
+    for ours, theirs in list(zip(*both(made(shape, backend), special_points()), strict=True))[:2]:
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
 
-def test_gradients_that_are_still_held_are_never_written_over():
+def test_gradients_in_use_are_never_overwritten():
     grid, point = made(SHAPES[0], "numba"), random_points(200)
     first, second = (torch.autograd.grad(k * grid(point).sum(), grid.table)[0] for k in (1, 2))
     assert torch.allclose(2 * first, second) and first.data_ptr() != second.data_ptr()
@@ -88,18 +88,18 @@ def test_gradients_that_are_still_held_are_never_written_over():
     assert third.data_ptr() == kept or third.abs().sum() > 0
 
 
-@pytest.mark.parametrize("carrier", CARRIERS)
-def test_outside_the_cube_nothing_pulls(carrier: Carrier):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_position_gradients_vanish_outside_the_cube(backend: Backend):
     point = torch.tensor([[1.5, 0.3, -0.2]], requires_grad=True)
-    (gradient,) = torch.autograd.grad(made(SHAPES[0], carrier)(point).sum(), point)
+    (gradient,) = torch.autograd.grad(made(SHAPES[0], backend)(point).sum(), point)
     assert gradient[0, 0] == 0 and gradient[0, 2] == 0 and gradient[0, 1] != 0
 
 
-@pytest.mark.parametrize("carrier", CARRIERS)
-def test_what_is_not_a_number_shows_and_spoils_nothing_else(carrier: Carrier):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nan_points_give_nan_features_and_affect_nothing_else(backend: Backend):
     point = random_points(300)
     point[7, 1], point[11, 0], point[12, 2] = torch.nan, torch.inf, -torch.inf
-    encoded = made(SHAPES[0], carrier)(point.requires_grad_())
+    encoded = made(SHAPES[0], backend)(point.requires_grad_())
     assert encoded[7].isnan().all()
     others = torch.arange(300) != 7
     assert encoded[others].isfinite().all()
@@ -107,12 +107,12 @@ def test_what_is_not_a_number_shows_and_spoils_nothing_else(carrier: Carrier):
     assert gradient[others].isfinite().all()
 
 
-@pytest.mark.parametrize("carrier", CARRIERS)
-def test_no_points_are_no_features(carrier: Carrier):
-    assert HashGrid(SHAPES[0], carrier)(torch.zeros(0, 3)).shape == (0, 8)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_points_give_no_features(backend: Backend):
+    assert HashGrid(SHAPES[0], backend)(torch.zeros(0, 3)).shape == (0, 8)
 
 
-def test_position_gradient_is_the_slope():
+def test_position_gradient_matches_finite_differences():
     grid = made(SHAPES[0]).double()
     assert torch.autograd.gradcheck(grid, [random_points(5).double().requires_grad_()], eps=1e-7, atol=1e-5)
 
@@ -123,7 +123,7 @@ def test_levels_grow_from_coarsest_to_finest_and_small_ones_are_dense():
     assert shape.rows == [64, 512, 4096, 4096, 4096]
 
 
-def test_every_cell_within_the_cube_has_both_its_vertices():
+def test_every_cell_in_the_cube_has_both_vertices():
     shape = HashGridShape(levels=6, coarsest=3, finest=50)
     stretch = HashGrid(shape).lattice.stretch.tolist()
     assert all(
@@ -131,7 +131,7 @@ def test_every_cell_within_the_cube_has_both_its_vertices():
     )
 
 
-def test_the_carrier_follows_device_precision_and_what_is_importable(
+def test_the_backend_follows_device_precision_and_what_is_importable(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     on_cuda = SimpleNamespace(dtype=torch.float32, device=torch.device("cuda"), is_cuda=True)
@@ -139,21 +139,21 @@ def test_the_carrier_follows_device_precision_and_what_is_importable(
     monkeypatch.setattr(
         "ebarf_ns.radiance.hash_grid.why_not", lambda name: "" if name in present else f"no {name} on this machine"
     )
-    assert fastest_carrier(torch.zeros(1, 3)) == "numba"
-    assert fastest_carrier(torch.zeros(1, 3).double()) == "torch"
-    assert fastest_carrier(on_cuda) == "triton"  # pyright: ignore[reportArgumentType]
+    assert fastest_backend(torch.zeros(1, 3)) == "numba"
+    assert fastest_backend(torch.zeros(1, 3).double()) == "torch"
+    assert fastest_backend(on_cuda) == "triton"  # pyright: ignore[reportArgumentType]
     present.add("tinycudann")
-    assert fastest_carrier(on_cuda) == "tcnn"  # pyright: ignore[reportArgumentType]
+    assert fastest_backend(on_cuda) == "tcnn"  # pyright: ignore[reportArgumentType]
     assert capsys.readouterr().err == ""
     present.clear()
     for _ in range(3):
-        assert fastest_carrier(on_cuda) == "torch"  # pyright: ignore[reportArgumentType]
+        assert fastest_backend(on_cuda) == "torch"  # pyright: ignore[reportArgumentType]
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "200 times slower" in said and "no triton on this machine" in said
 
 
 class StandInEncoding(nn.Module):
-    """tiny-cuda-nn's HashGrid by its published formulas: scale, resolution, offsets, index, interpolation."""
+    """tiny-cuda-nn's HashGrid from its published formulas: scale, resolution, offsets, index, interpolation."""
 
     def __init__(self, inputs: int, configuration: dict, dtype: torch.dtype):
         super().__init__()
@@ -185,7 +185,7 @@ class StandInEncoding(nn.Module):
 
 
 @pytest.mark.parametrize("shape", SHAPES[:2], ids=lambda shape: f"{shape.levels}x{shape.features}")
-def test_our_table_means_the_same_to_tiny_cuda_nn(shape: HashGridShape, monkeypatch: pytest.MonkeyPatch):
+def test_our_table_works_with_tiny_cuda_nn(shape: HashGridShape, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "tinycudann", SimpleNamespace(Encoding=StandInEncoding))
     monkeypatch.setattr("ebarf_ns.radiance.hash_grid._encodings", {})
     grid = made(shape, "tcnn")
@@ -227,6 +227,6 @@ def test_triton_kernels_compile_to_machine_code_without_a_gpu(compute_capability
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
 def test_cuda_agrees_with_the_reference(shape: HashGridShape):
     grid = made(shape).cuda()
-    assert fastest_carrier(random_points(1).cuda()) in ("triton", "tcnn")
+    assert fastest_backend(random_points(1).cuda()) in ("triton", "tcnn")
     for ours, theirs in zip(*both(grid, random_points(5000).cuda()), strict=True):
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()

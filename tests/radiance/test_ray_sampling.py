@@ -79,7 +79,7 @@ def test_resampled_edges_are_ordered_span_everything_and_follow_the_weights(jitt
     assert inside > 0.8
 
 
-def test_even_weights_give_even_samples_whose_jitter_averages_to_nothing():
+def test_even_weights_give_even_samples_with_zero_mean_jitter():
     edges = torch.linspace(2, 4, 9)[None]
     jitters = torch.linspace(-0.5, 0.5, 101)[:-1, None]
     fine = resample(edges.expand(100, 9), torch.ones(100, 8), 16, jitters)
@@ -101,7 +101,7 @@ def test_empty_space_shows_the_background_at_the_far_end():
     assert float(rendered.intensity) == pytest.approx(0.25) and float(rendered.depth) == pytest.approx(0.4)
 
 
-def test_density_grid_remembers_where_the_wall_is():
+def test_density_grid_caches_the_wall():
     grid = DensityGrid(16, bounded=True)
     generator = torch.Generator().manual_seed(0)
     for k in range(3 * grid.refresh_share):
@@ -111,7 +111,7 @@ def test_density_grid_remembers_where_the_wall_is():
 
 
 @pytest.mark.parametrize("bounded", [True, False])
-def test_density_grid_keeps_up_with_what_rays_come_across(bounded: bool):
+def test_density_grid_is_updated_along_rays(bounded: bool):
     grid = DensityGrid(16, bounded)
     point = torch.tensor([[0.9, 0.1, -0.3], [-0.2, 0.5, 0.5], [-0.2, 0.5, 0.5]])
     for _ in range(10):
@@ -120,7 +120,7 @@ def test_density_grid_keeps_up_with_what_rays_come_across(bounded: bool):
     assert (grid.density != 1).sum() == 2
 
 
-def test_only_rays_of_training_are_remembered():
+def test_only_training_rays_update_the_density_grid():
     torch.manual_seed(0)
     field = RadianceField(HashGridShape(4, 2, 4, 32, 10), bounded=True)
     with torch.no_grad():
@@ -164,13 +164,13 @@ def test_samples_placed_in_one_pass_are_those_of_the_reference(bounded: bool, pa
         far, jitter = far.view(2, -1).amax(0).repeat(2), jitter[:20].repeat(2, 1)
     ours = ray_sampling_numba.importance_edges(grid, rays, 0.05, far, 64, 0.1, 0.3, 24, jitter, pairs)
     theirs = importance_edges(grid, rays, 0.05, far, 64, 0.1, 0.3, 24, jitter, pairs)
-    # A point on a cell's border may fall to either side.
+    # A point on a cell border may fall on either side.
     assert ((ours - theirs).abs() < 2e-3 * far[:, None].clamp_min(0.1)).float().mean() > 0.98
     assert (ours.diff(dim=-1) >= 0).all() and (not pairs or torch.equal(ours[:20], ours[20:]))
 
 
 @pytest.mark.parametrize("place", [importance_edges, ray_sampling_numba.importance_edges])
-def test_the_wall_behind_a_cell_that_a_ray_may_only_graze_is_looked_at_too(place):
+def test_the_wall_behind_a_grazed_cell_is_sampled_too(place):
     grid = DensityGrid(16, bounded=True)
     near_object, wall = (torch.tensor([[x, 0.01, 0.01]]) for x in (0.3, 0.97))
     grid.density.zero_()
@@ -187,13 +187,13 @@ def test_the_wall_behind_a_cell_that_a_ray_may_only_graze_is_looked_at_too(place
     assert seen[0] >= 2 and seen[1] == 0
 
 
-def test_no_rays_are_no_samples():
+def test_no_rays_give_no_samples():
     rays, grid = Rays(torch.zeros(0, 3), torch.zeros(0, 3)), DensityGrid(16, bounded=True)
     for place in (importance_edges, ray_sampling_numba.importance_edges):
         assert place(grid, rays, 0.05, torch.zeros(0), 64, 0.1, 0.3, 24, torch.zeros(0, 1), False).shape == (0, 25)
 
 
-def test_a_density_that_is_not_finite_is_not_remembered():
+def test_a_density_that_is_not_finite_is_not_cached():
     grid = DensityGrid(8, bounded=True)
     point = torch.tensor([[0.1, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.6, 0.1, 0.1]])
     grid.remember(point, torch.tensor([torch.nan, torch.inf, 5.0]))

@@ -44,7 +44,7 @@ f 1/1 3/3 4/4
 
 
 def look(mesh: RoomWithMesh, *targets: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """From x = -1.5 towards points (y, z) at x = 0."""
+    """Cast rays from x = -1.5 towards points (y, z) at x = 0."""
     origin = np.tile([-1.5, 0.0, 0.0], (len(targets), 1))
     towards = np.array([[0.0, *target] for target in targets]) - origin
     return mesh.cast(origin, towards / np.linalg.norm(towards, axis=1, keepdims=True))
@@ -66,7 +66,7 @@ def test_a_texture_is_seen_the_right_way_up(tmp_path: Path):
     picture[:4, :4] = 255
     cv2.imwrite(str(tmp_path / "picture.png"), picture)
     mesh = RoomWithMesh(EMPTY, tmp_path / "square.obj", 1.0, (0.0, 0.0, 0.0))
-    # Upper left of the picture: low in u, high in v, hence low in y, high in z.
+    # The upper left of the image has low u and high v, hence low y and high z.
     radiance, _ = look(mesh, (-0.3, 0.3), (0.3, 0.3), (-0.3, -0.3), (0.3, -0.3))
     assert radiance[0] > 0.9 and (radiance[1:] < 0.1).all()
 

@@ -1,4 +1,4 @@
-"""The recorder against closed form: stripes on a wall, and a camera that slides past them."""
+"""The recorder against a closed-form solution: a camera that slides past stripes on a wall."""
 
 from dataclasses import dataclass, replace
 
@@ -51,7 +51,7 @@ def view_of(stripes: Stripes = STRIPES, speed_m_s: float = 0.5, width: int = 60,
 
 
 def expected_events(stripes: Stripes, x0: float, speed_m_s: float, level: float) -> list[tuple[float, int]]:
-    """Times [us] and polarities by inverting the sinusoid on each stretch between its extremes."""
+    """Times [us] and polarities from inverting the sinusoid between successive extrema."""
     rate = 2 * np.pi * stripes.cycles_per_m
     phase0, phase_end = rate * x0, rate * (x0 + speed_m_s * END_US * 1e-6)
     turns = np.arange(np.ceil(phase0 / np.pi - 0.5), phase_end / np.pi - 0.5) * np.pi + np.pi / 2
@@ -70,7 +70,7 @@ def expected_events(stripes: Stripes, x0: float, speed_m_s: float, level: float)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.05, 0.5, 5.0])
-def test_counts_and_times_of_a_moving_sinusoid_are_those_of_the_closed_form(speed_m_s: float):
+def test_counts_and_times_of_a_moving_sinusoid_match_the_closed_form(speed_m_s: float):
     stripes = Stripes()
     view = view_of(stripes, speed_m_s)
     events = record(view, SENSOR, END_US, 0)
@@ -89,11 +89,11 @@ def test_a_sharp_edge_gives_all_its_events_when_it_passes():
     events = record(view, SENSOR, END_US, 0)
     edges_us = (np.arange(-2, 5) / 4 - (events.x[:, None] - 29.5) / 80) / 0.5 * 1e6
     assert (np.abs(edges_us - events.t_us[:, None]).min(axis=1) <= 1.5).all()
-    # Each passage is worth a change of 2 in log brightness.
+    # Each crossing changes log brightness by 2.
     assert len(events) > 500 and np.bincount(events.x).min() >= 2 * (2 / 0.3 - 1)
 
 
-def test_several_rays_a_pixel_soften_an_edge():
+def test_several_rays_per_pixel_soften_an_edge():
     hard, soft = (
         record(view_of(Stripes(sharp=True, cycles_per_m=0.5), rays_per_pixel=rays), SENSOR, END_US, 0)
         for rays in (1, 4)
@@ -120,12 +120,12 @@ def test_drifting_thresholds_leave_the_order_of_a_pixels_events(drift: float):
     assert len(events) == pytest.approx(len(steady), rel=0.3)
     for x in range(0, 60, 7):
         mine = (events.x == x) & (events.y == 0)
-        # Between its extremes a sinusoid goes one way, and so do its events: a run of one polarity, then of the other.
+        # A sinusoid is monotonic between extrema, so that runs of one polarity alternate with runs of the other.
         runs = 1 + np.count_nonzero(np.diff(events.polarity[mine]))
         assert runs <= 10
 
 
-def test_a_pixel_is_never_early_after_an_event():
+def test_no_event_falls_in_the_refractory_period():
     events = record(view_of(speed_m_s=5.0), replace(SENSOR, refractory_us=2000.0), END_US, 0)
     gaps = [np.diff(events.t_us[(events.x == x) & (events.y == 1)]).min() for x in range(60)]
     assert min(gaps) >= 1999

@@ -10,7 +10,7 @@ CLEAN = SensorModel(threshold_on=0.2, threshold_off=0.3)
 
 
 def watch(curves: np.ndarray, t_us: np.ndarray, model: SensorModel = CLEAN) -> Crossings:
-    """Events of pixels whose log brightness is given by column."""
+    """Events of pixels whose log brightness is given per column."""
     sensor = EventSensor(model, float(t_us[-1]), 0, curves[0])
     pixel = np.repeat(np.arange(curves.shape[1]), len(t_us) - 1)
     return sensor.see(pixel, np.tile(t_us[1:].astype(float), curves.shape[1]), curves[1:].T.ravel())
@@ -47,15 +47,15 @@ def test_still_light_is_silent(level: float):
     assert (watch(steady, np.arange(50) * 100).t_us >= 4800).all()
 
 
-def test_a_pixel_is_blind_after_an_event_and_then_compares_with_what_it_sees():
+def test_the_refractory_period_resets_the_reference_level():
     curves, t_us = ramps(3)
     events = watch(curves, t_us, replace(CLEAN, refractory_us=5000))
-    # The ramp takes 10 ms a threshold, from where blindness ended.
+    # The ramp takes 10 ms per threshold, starting at the end of the refractory period.
     for pixel in range(3):
         assert np.allclose(np.diff(events.t_us[events.pixel == pixel]), 15_000)
 
 
-def test_leak_makes_positive_events_of_still_light():
+def test_leak_makes_positive_events_in_constant_light():
     events = watch(np.zeros((101, 50)), np.arange(101) * 100_000.0, replace(CLEAN, leak_hz=0.5))
     assert (events.polarity == 1).all() and len(events.pixel) == pytest.approx(0.5 * 10 * 50, abs=50)
 
@@ -70,15 +70,15 @@ def test_noise_comes_at_its_rate_and_hot_pixels_at_theirs():
     assert (events.polarity > 0).mean() == pytest.approx(0.5, abs=0.05) and np.isnan(events.before).all()
 
 
-def test_a_noise_event_resets_what_a_pixel_compares_with():
+def test_a_noise_event_resets_the_reference_level():
     curves, t_us = ramps(400, height=0.15)
-    # Never a whole threshold in one go, and still now and then one from where noise has left it.
+    # Never a whole threshold at once, but occasionally a crossing from a level that noise has shifted.
     quiet, noisy = (watch(curves, t_us, replace(CLEAN, shot_noise_hz=hz)) for hz in (0.0, 50.0))
     reported = ~np.isnan(noisy.before)
     assert 0 < reported.sum() < len(quiet.pixel)
 
 
-def test_thresholds_differ_between_pixels_by_what_was_asked_for():
+def test_threshold_mismatch_has_the_given_size():
     curves, t_us = ramps(2000)
     events = watch(curves, t_us, replace(CLEAN, threshold_mismatch=0.05))
     thresholds = 20.0 / np.bincount(events.pixel, minlength=2000)
@@ -86,7 +86,7 @@ def test_thresholds_differ_between_pixels_by_what_was_asked_for():
     assert thresholds.mean() == pytest.approx(0.2, rel=0.02)
 
 
-def test_thresholds_grow_by_what_was_asked_for():
+def test_threshold_drift_has_the_given_size():
     t_us = np.arange(0, 1_000_001, 1000.0)
     sensor = EventSensor(replace(CLEAN, threshold_drift=0.5), 1e6, 0, np.zeros(1))
     chunks = [sensor.see(np.zeros(1, int), t_us[k : k + 1], 20e-6 * t_us[k : k + 1]) for k in range(1, len(t_us))]
@@ -106,7 +106,7 @@ def test_limited_bandwidth_answers_a_step_as_a_low_pass_does():
 
 
 def lagging_events_us(intensity: float, model: SensorModel, step_us: float = 20.0) -> np.ndarray:
-    """Events of a pixel whose log brightness rises by 2 within a microsecond, to this intensity."""
+    """Events of a pixel whose log brightness rises by 2 within a microsecond, to the given intensity."""
     t_us = np.r_[0.0, 1.0, np.arange(step_us, 150_001, step_us)]
     return watch(np.where(t_us > 0, 0.0, -2.0)[:, None] + np.log(intensity), t_us, model).t_us
 
@@ -116,7 +116,7 @@ FOLLOWS_LIGHT = replace(CLEAN, cutoff_hz=100.0, cutoff_reference=0.5)
 
 @pytest.mark.parametrize("intensity", [0.25, 1.0])
 def test_bandwidth_that_follows_the_light_answers_a_step_as_a_low_pass_does(intensity: float):
-    # The first level lies somewhere within a threshold of the start.
+    # The first level lies within a threshold of the start.
     level = EventSensor(FOLLOWS_LIGHT, 1.0, 0, np.zeros(1)).level[0]
     expected = np.array([level + 0.2 * k for k in range(1, 20) if 0 < level + 0.2 * k < 2])
     lag_us = 1e6 / (2 * np.pi * 100 * intensity / 0.5)
@@ -138,7 +138,7 @@ def test_bandwidth_without_a_reference_is_the_same_at_any_light():
     model = replace(CLEAN, cutoff_hz=100.0, cutoff_reference=0.0)
     assert model == replace(CLEAN, cutoff_hz=100.0)
     assert np.allclose(lagging_events_us(1e-3, model), lagging_events_us(1e3, model), atol=1e-6)
-    # A reference without a bandwidth to refer to changes nothing either.
+    # A reference without a bandwidth has no effect either.
     clean = lagging_events_us(1e-3, CLEAN)
     assert np.array_equal(clean, lagging_events_us(1e-3, replace(CLEAN, cutoff_reference=0.5)))
 
@@ -147,12 +147,12 @@ def test_bandwidth_grows_with_the_light_while_it_rises():
     slope, start = 40.0, 0.1
     t_us = np.arange(0, 50_001, 200.0)
     events = watch(slope * 1e-6 * t_us[:, None] + np.log(start), t_us, replace(FOLLOWS_LIGHT, cutoff_reference=1.0))
-    # How far the pixel is behind solves d' = slope - bandwidth * exp(slope * t) * d, as long as no bound is met.
+    # The lag d of the pixel solves d' = slope - bandwidth * exp(slope * t) * d while the bounds are inactive.
     first, now = (2 * np.pi * 100 * start / slope * np.exp(slope * 1e-6 * at) for at in (0.0, events.t_us))
     behind = np.exp(-now) * (expi(now) - expi(first))
     inside = start * np.exp(slope * 1e-6 * events.t_us) < 2.8
     seen = (slope * 1e-6 * events.t_us - behind)[inside]
-    # The light at either end of a step instead of halfway would be wrong by 1e-3.
+    # Using the light at either end of a step instead of the midpoint would give an error of 1e-3.
     level = EventSensor(CLEAN, 1.0, 0, np.zeros(1)).level[0]
     assert len(seen) > 5 and np.allclose(seen, level + 0.2 * np.arange(1, len(seen) + 1), atol=2e-5, rtol=0)
 
@@ -164,7 +164,7 @@ def test_bandwidth_follows_the_light_and_not_the_leak():
     assert len(same.t_us) > 90 and np.allclose(same.t_us, follows.t_us, atol=1e-3, rtol=0)
 
 
-def test_timestamps_jitter_by_what_was_asked_for_and_stay_within_the_recording():
+def test_timestamp_jitter_has_the_given_size_and_stays_within_the_recording():
     sensor = EventSensor(replace(CLEAN, jitter_us=30.0), 1e6, 0, np.zeros(1))
     t_us = np.linspace(0, 1e6, 20_000)
     jittered = sensor.jitter(t_us)
@@ -172,7 +172,7 @@ def test_timestamps_jitter_by_what_was_asked_for_and_stay_within_the_recording()
     assert (jittered - t_us)[100:-100].std() == pytest.approx(30, rel=0.05)
 
 
-def test_thresholds_that_drift_make_no_events_of_still_light():
+def test_drifting_thresholds_make_no_events_in_constant_light():
     still = np.full((200, 2000), -1.0)
     grows = watch(still, np.arange(200) * 5_000.0, replace(CLEAN, threshold_drift=1.0))
     assert len(grows.pixel) == 0

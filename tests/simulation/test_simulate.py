@@ -22,7 +22,7 @@ from ebarf_ns.simulation.view import View
 from tests.simulation.test_mesh import COLOURED_SQUARE
 
 
-def test_scene_is_whole_and_its_pictures_show_something(tiny_scene: Path):
+def test_scene_is_complete_and_its_images_are_not_blank(tiny_scene: Path):
     scene = read_scene(tiny_scene)
     recording = read_recording(scene.events, scene.camera.width, scene.camera.height)
     assert len(recording) > 5000 and 0.4 < (recording.polarity > 0).mean() < 0.6
@@ -33,14 +33,14 @@ def test_scene_is_whole_and_its_pictures_show_something(tiny_scene: Path):
 
 
 def test_events_agree_with_the_room_seen_from_the_true_poses(tiny_scene: Path):
-    """The simulator against itself by another way: radiance along the true rays at the events' times."""
+    """Check events independently: radiance along the true rays at the event times."""
     scene = read_scene(tiny_scene)
     assert scene.groundtruth and scene.contrast_threshold
     recording = read_recording(scene.events, scene.camera.width, scene.camera.height)
     index = index_pairs(lambda: [recording], scene.camera.width, scene.camera.height)
     pairs = index.draw(np.full(2000, 3), np.random.default_rng(0))
     truth = read_tum(scene.groundtruth)
-    # The rays of a pixel are the simulator's; where they go is worked out anew.
+    # The rays of a pixel are the simulator's; their poses are computed independently.
     rays = View(Room(), CATALOGUE["handheld-room"](0).motion, scene.camera)
     corners = torch.from_numpy(rays.bearings[pairs.pixel])
 
@@ -53,7 +53,7 @@ def test_events_agree_with_the_room_seen_from_the_true_poses(tiny_scene: Path):
     change = log_radiance(pairs.t1_us) - log_radiance(pairs.t0_us)
     reported = pairs.polarity_sum * scene.contrast_threshold.on
     error = np.abs(change - reported) / scene.contrast_threshold.on
-    # Interpolating 200 poses a second, and edges that pass within a microsecond, leave something.
+    # Tolerance for interpolating 200 poses per second and for edges that pass within a microsecond.
     assert np.median(error) < 0.05 and np.corrcoef(change, reported)[0, 1] > 0.95
 
 
@@ -85,7 +85,7 @@ def test_every_scene_of_the_catalogue_can_be_simulated(tmp_path: Path, name: Sce
     assert (truth.poses.position.numpy() > lower).all() and (truth.poses.position.numpy() < upper).all()
 
 
-def test_a_scene_may_keep_its_thresholds_to_itself(tmp_path: Path):
+def test_a_scene_may_omit_its_thresholds(tmp_path: Path):
     told, untold = (simulate(replace(SMALL, tell_thresholds=told), tmp_path / f"told {told}") for told in (True, False))
     assert told.contrast_threshold and untold.contrast_threshold is None
     assert told.events.read_bytes() == untold.events.read_bytes()
@@ -112,11 +112,11 @@ def test_a_window_is_a_thousand_times_brighter_than_the_room():
     assert radiance.max() > 100 * np.median(radiance) and radiance.min() < 1
 
 
-def test_a_mesh_takes_the_place_of_boxes_and_balls_and_of_nothing_else(tmp_path: Path):
+def test_a_mesh_replaces_only_boxes_and_balls(tmp_path: Path):
     (tmp_path / "square.ply").write_text(COLOURED_SQUARE)
     settings = replace(SMALL, scene="hdr-window", mesh=tmp_path / "square.ply", duration_s=2.0, frames=5)
     scene = simulate(settings, tmp_path / "scene")
-    # Daylight is beyond what a frame can hold.
+    # Daylight saturates the frames.
     assert max(float(read_frame(frame).max()) for frame in scene.frames) == 1
 
 

@@ -21,7 +21,7 @@ def deviations(noisy: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return shift.numpy(), quat_wxyz_log(turn).norm(dim=1).numpy()
 
 
-def test_white_noise_has_the_size_that_was_asked_for():
+def test_white_noise_has_the_given_size():
     noisy = perturb(TRUE, TrajectoryErrors(0.03, 0.02), seed=1)
     error = trajectory_error(noisy, TRUE, "se3")
     assert error.ate_m == pytest.approx(0.03 * np.sqrt(3), rel=0.1)
@@ -31,10 +31,10 @@ def test_white_noise_has_the_size_that_was_asked_for():
     assert not torch.equal(other.poses.position, noisy.poses.position)
 
 
-def test_drift_starts_at_nothing_grows_and_reaches_its_size():
+def test_drift_starts_at_zero_and_reaches_its_size():
     shift, turn = deviations(perturb(TRUE, TrajectoryErrors(**NONE, position_drift=0.05, rotation_drift_rad=0.04), 0))
     assert shift[0] < 1e-12 and shift.max() == pytest.approx(0.05) and turn.max() == pytest.approx(0.04)
-    # From keyframe to keyframe it hardly changes.
+    # It hardly changes between neighbouring keyframes.
     assert np.abs(np.diff(shift)).max() < 0.01
 
 

@@ -1,1 +1,1 @@
-"""Recordings as cameras and datasets write them, one file per format."""
+"""Readers for the recordings of cameras and datasets, one module per format."""

@@ -17,7 +17,7 @@ _MAGIC = b"#!AER-DAT4.0\r\n"
 
 
 def read_aedat4(path: Path) -> Source:
-    """The first stream of events; raises :class:`RecordingError` for a file that is damaged or has none."""
+    """Read the first event stream; raises :class:`RecordingError` for a damaged file or one without events."""
     _check_container(path)
     streams = _library(path, lambda: aedat.Decoder(path).id_to_stream())
     events = {number: stream for number, stream in streams.items() if stream["type"] == "events"}
@@ -29,7 +29,7 @@ def read_aedat4(path: Path) -> Source:
 
 
 def read_aedat4_frames(path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """The frames among the events, grey or BGR, each with the microsecond in the middle of its exposure."""
+    """Read the frames, grey or BGR, with the middle of their exposure in microseconds."""
     _check_container(path)
     for packet in _packets(path):
         if (frame := packet.get("frame")) is not None:
@@ -52,18 +52,18 @@ def _packets(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _library(path: Path, call: Any) -> Any:
-    """What the library says, or in one line why it cannot."""
+    """Call the library; its failures become one-line errors."""
     try:
         return call()
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:
-        # It panics, which is no Exception, at some damages.
+        # Some damage makes it panic, which is not an Exception.
         raise RecordingError(f"{path}: not a whole AEDAT4 file ({error})") from None
 
 
 def _check_container(path: Path) -> None:
-    """Walk over the packets, each of which says how long it is: a file that was cut off ends within one."""
+    """Walk over the packets by their lengths: a truncated file ends within one."""
     size = path.stat().st_size
     with path.open("rb") as file:
         start = file.read(len(_MAGIC) + 4)
@@ -91,7 +91,7 @@ def _check_container(path: Path) -> None:
 
 
 def _data_table(header: bytes) -> int:
-    """Where the packets end, by the header's second field (a flatbuffer's table); -1 where it does not say."""
+    """End of the packets from the header's second field (a flatbuffer table); -1 if not given."""
     try:
         (root,) = struct.unpack_from("<I", header, 0)
         (to_vtable,) = struct.unpack_from("<i", header, root)

@@ -1,7 +1,7 @@
-"""Arrays in files of NumPy (``.npz``, ``.npy``) and MATLAB (``.mat``), or in folders of such files.
+"""Arrays in NumPy (``.npz``, ``.npy``) and MATLAB (``.mat``) files, or in folders of such files.
 
-A file has a column each for x, y, time and polarity, as Robust e-NeRF and EventNeRF have them, a structured array with
-fields of such names, as Metavision, tonic and expelliarmus have them, or rows of four numbers, as ESIM has them.
+A file has one array each for x, y, time and polarity (Robust e-NeRF, EventNeRF), a structured array with such fields
+(Metavision, tonic, expelliarmus), or rows of four numbers (ESIM).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
     guessed_unit,
+    inferred_order,
     integers,
     is_whole,
     look_like_events,
     named,
+    sampled,
     spaced,
-    telling,
-    told_order,
     unit_of,
 )
 from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds, numbered
@@ -36,21 +36,21 @@ from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds,
 _EVENTS_AT_ONCE = 1 << 20
 _ESIM = "xytp"
 Arrays = Mapping[str, Any]
-"""Those of a file, and structs of them, by name."""
+"""Arrays of a file, or mappings for structs, by name."""
 
 
 @dataclass(frozen=True)
 class _Found:
-    """The four columns of a file; without names, in the order that they have there."""
+    """The four columns of a file; unnamed ones in file order."""
 
     columns: tuple[np.ndarray, ...]
     unit: TimeUnit | None = None
-    """Where a name says so."""
+    """Unit of the times, if a name gives it."""
     order: str | None = "xytp"
     """None: not known yet."""
 
     def by_role(self, order: str) -> tuple[np.ndarray, ...]:
-        """x, y, t and p, where columns without names have this order."""
+        """x, y, t and p, with ``order`` for unnamed columns."""
         order = self.order or order
         return tuple(self.columns[order.index(role)] for role in "xytp")
 
@@ -58,19 +58,18 @@ class _Found:
 def read_npz(
     path: Path, time_unit: TimeUnit | None = None, columns: str | None = None, part: str | None = None
 ) -> Source:
-    """One file, or a folder's, by name; raises :class:`RecordingError`.
+    """Read an npz file, or all in a folder sorted by name; raises :class:`RecordingError`.
 
-    Times are nanoseconds in Robust e-NeRF's files (which have ``position``), what their name says, as in ``t_ns``,
-    microseconds where they are whole numbers and else seconds, unless ``time_unit`` says otherwise. ``columns`` is the
-    order of columns without names, ``part`` the array that has them, where there are several.
+    Unless ``time_unit`` is given, times are nanoseconds in Robust e-NeRF's files (which have ``position``), else in the
+    unit of their name, as in ``t_ns``, else microseconds if integer and seconds if not. ``columns`` is the order of
+    unnamed columns, ``part`` selects an array if there are several.
     """
     return _read(path, "npz", _npz, time_unit, columns, part)
 
 
 def read_npy(path: Path, time_unit: TimeUnit | None = None, columns: str | None = None) -> Source:
-    """ESIM's and E-NeRF's ``*.npy`` files, by name, or one; as :func:`read_npz`, but for rows of ESIM's order.
-
-    Those have floats of nanoseconds.
+    """Read a npy file, or all in a folder sorted by name, such as ESIM's and E-NeRF's; as :func:`read_npz`, except that
+    integer-valued floats in ESIM's column order are nanoseconds.
     """
     return _read(path, "npy", _npy, time_unit, columns, None)
 
@@ -78,7 +77,7 @@ def read_npy(path: Path, time_unit: TimeUnit | None = None, columns: str | None 
 def read_mat(
     path: Path, time_unit: TimeUnit | None = None, columns: str | None = None, part: str | None = None
 ) -> Source:
-    """Variables x, y, ts and pol of a MATLAB 5 file, or of a struct in it; as :func:`read_npz`."""
+    """Read variables x, y, ts and pol of a MATLAB 5 file, or of a struct in it; as :func:`read_npz`."""
     return _read(path, "mat", _mat, time_unit, columns, part)
 
 
@@ -98,15 +97,15 @@ def _read(
         with arrays_of(file) as arrays:
             return _found(file, arrays, part)
 
-    # What lies in memory already is not read again.
+    # Reuse a single file that is already in memory.
     first = _first_with_events(files, open_one)
     last = _first_with_events(files[::-1], open_one) if len(files) > 1 else first
     opened = open_one if len(files) > 1 else lambda file: first
     ends = (first, last) if len(files) > 1 else (first,)
-    samples = [np.concatenate(parts) for parts in zip(*(telling(end.columns) for end in ends), strict=True)]
+    samples = [np.concatenate(parts) for parts in zip(*(sampled(end.columns) for end in ends), strict=True)]
     order, notes = "", []
     if first.order is None:
-        order, how = (columns, "as stated") if columns else told_order(path, samples, _ESIM)
+        order, how = (columns, "as stated") if columns else inferred_order(path, samples, _ESIM)
         notes.append(f"columns {spaced(order)}, {how}")
     t = replace(first, columns=tuple(samples)).by_role(order)[2]
     unit = time_unit or first.unit or ("ns" if kind == "npy" and order == _ESIM and _of_esim(t) else guessed_unit(t))
@@ -119,13 +118,13 @@ def _read(
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """So that 10 comes after 9 where names have no leading zeros."""
+    """Sort key that puts 10 after 9 in names without leading zeros."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part) if part.isdigit() else -1, part) for part in parts]
 
 
 def _first_with_events(files: list[Path], opened: Callable[[Path], _Found]) -> _Found:
-    """The first file that is not empty, or the last one."""
+    """The first non-empty file, or the last one."""
     for file in files:
         found = opened(file)
         if len(found.columns[0]):
@@ -138,7 +137,7 @@ def _of_esim(t: np.ndarray) -> bool:
 
 
 def _found(path: Path, arrays: Arrays, part: str | None) -> _Found:
-    """Where the events are among the arrays of a file."""
+    """Find the events among the arrays of a file."""
     if part is not None:
         if part not in arrays:
             raise RecordingError(f"{path}: has no array {part}, expected one of {', '.join(arrays) or 'none'}")
@@ -153,9 +152,9 @@ def _found(path: Path, arrays: Arrays, part: str | None) -> _Found:
         if found:
             candidates[name] = found
     if len(candidates) > 1:
-        # Matrices of poses and cameras have four columns as well.
+        # Matrices of poses and cameras also have four columns.
         candidates = {
-            name: found for name, found in candidates.items() if found.order or look_like_events(telling(found.columns))
+            name: found for name, found in candidates.items() if found.order or look_like_events(sampled(found.columns))
         } or candidates
     if len(candidates) != 1:
         raise RecordingError(_neither(path, arrays, list(candidates)))
@@ -176,7 +175,7 @@ def _by_names(path: Path, arrays: Arrays) -> _Found | None:
 
 
 def _without_names(arrays: Arrays) -> _Found | None:
-    """Four columns whose names say nothing, such as NumPy's own."""
+    """Four columns with uninformative names, such as NumPy's defaults."""
     if len(arrays) != len(ROLES):
         return None
     columns = tuple(arrays[name] for name in arrays)
@@ -194,7 +193,7 @@ def _of_position(path: Path, position: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _flat(column: np.ndarray) -> np.ndarray:
-    """MATLAB has but matrices, of which one side is 1."""
+    """Flatten MATLAB's vectors, which are matrices with one side of 1."""
     return column.reshape(-1) if column.ndim == 2 and 1 in column.shape else column
 
 
@@ -231,7 +230,7 @@ def _npy(path: Path) -> Iterator[Arrays]:
     try:
         array = np.load(path, mmap_mode="r")
     except Exception as error:
-        # NumPy reads the header as Python: what a damaged one makes it raise has no common kind.
+        # NumPy evaluates the header as Python: a damaged one can raise any exception.
         raise RecordingError(f"{path}: not a whole npy file of a plain array ({error})") from None
     if not isinstance(array, np.ndarray):
         raise RecordingError(f"{path}: not an npy file, expected rows of x, y, t and polarity")
@@ -244,13 +243,13 @@ def _mat(path: Path) -> Iterator[Arrays]:
         variables = loadmat(path)
         arrays = {name: _unwrapped(value) for name, value in variables.items() if not name.startswith("__")}
     except Exception as error:
-        # What a damaged file makes the library raise has no common kind.
+        # A damaged file can raise any exception.
         raise RecordingError(f"{path}: not a whole MATLAB 5 file ({type(error).__name__}: {error})") from None
     yield arrays
 
 
 def _unwrapped(value: Any) -> Any:
-    """A struct of arrays as a mapping."""
+    """Convert a struct of arrays to a mapping."""
     if getattr(value, "dtype", None) is not None and value.dtype.names and value.size == 1:
         return {name: value[name].item() for name in value.dtype.names}
     return np.asarray(value)

@@ -1,7 +1,7 @@
-"""ROS 1 and ROS 2 bags with events, through the ``rosbags`` library: no ROS needed.
+"""ROS 1 and ROS 2 bags with events, through the ``rosbags`` library; ROS is not needed.
 
-``dvs_msgs/EventArray`` (and ``prophesee_event_msgs/EventArray``, which is the same) is taken apart here, as an array:
-a Python object for each event would take minutes. ``event_camera_msgs/EventPacket`` holds what the sensor sent.
+``dvs_msgs/EventArray`` (and the identical ``prophesee_event_msgs/EventArray``) is parsed here into arrays, since a
+Python object per event would take minutes. ``event_camera_msgs/EventPacket`` holds the sensor's raw data.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ebarf_ns.formats.source import Piece, Source
 
 _ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 _PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
-# ROS 1 packs an event's 13 bytes; ROS 2 aligns its fields to their size, from the second event on like this.
+# ROS 1 packs an event into 13 bytes; ROS 2 aligns fields to their size, as below from the second event on.
 _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nsec", "<u4"), ("p", "u1")])
 _ROS2_EVENT = np.dtype(
     {
@@ -35,7 +35,7 @@ _ROS2_EVENT = np.dtype(
     }
 )
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-# Bytes a channel, channels, and what makes grey of them; ROS and OpenCV name a Bayer pattern by different corners.
+# Bytes per channel, channels, and conversion to grey; ROS and OpenCV name a Bayer pattern by different corners.
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "mono8": (1, 1, None), "8UC1": (1, 1, None), "mono16": (2, 1, None), "16UC1": (2, 1, None),
     "bgr8": (1, 3, cv2.COLOR_BGR2GRAY), "8UC3": (1, 3, cv2.COLOR_BGR2GRAY), "rgb8": (1, 3, cv2.COLOR_RGB2GRAY),
@@ -50,7 +50,7 @@ _MONO_EVENT = np.dtype([("t_ns", "<u4"), ("x", "<u2"), ("y_p", "<u2")])
 
 
 def read_bag(path: Path, topic: str | None = None) -> Source:
-    """The events of ``topic``, or of the only topic that has any; raises :class:`RecordingError`."""
+    """Read the events of ``topic``, by default the only one with events; raises :class:`RecordingError`."""
     with _opened(path) as bag:
         connections = _of_events(path, bag, topic)
         size = next((_sensor_size(bag, raw, one) for one, _, raw in bag.messages(connections)), None)
@@ -60,7 +60,7 @@ def read_bag(path: Path, topic: str | None = None) -> Source:
 
 
 def _of_events(path: Path, bag: AnyReader, topic: str | None) -> list[Any]:
-    """The connections of the topic that is asked for, or of the only one with events."""
+    """The connections of the given topic, or of the only one with events."""
     topics = {one.topic for one in bag.connections if one.msgtype in _ARRAYS + _PACKETS}
     if topic is None and len(topics) != 1:
         everything = ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in bag.connections)) or "none"
@@ -75,9 +75,9 @@ def _of_events(path: Path, bag: AnyReader, topic: str | None) -> list[Any]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[AnyReader]:
-    """The bag; whatever a damaged one makes the library do, for it promises no kind of exception, is one line."""
+    """Open a bag; any exception of the library, which documents none, becomes a one-line error."""
     if path.is_file() and path.suffix != ".bag":
-        # A ROS 2 bag is a folder, and one of ROS 1 is known by its suffix. MCAP's files describe themselves.
+        # A ROS 2 bag is a folder, and a ROS 1 bag is recognised by its suffix. MCAP files are self-describing.
         if (path.parent / "metadata.yaml").is_file():
             path = path.parent
         elif path.suffix != ".mcap":
@@ -134,15 +134,15 @@ def _sensor_size(bag: AnyReader, raw: bytes, connection: Any) -> tuple[int, int]
 
 
 def _after_header(raw: bytes, ros2: bool) -> int:
-    """Where the fields after a message's std_msgs/Header begin."""
-    # ROS 1: number, seconds, nanoseconds; ROS 2: byte order, seconds, nanoseconds. Then the frame's name.
+    """Offset of the fields after a message's std_msgs/Header."""
+    # ROS 1: sequence number, seconds, nanoseconds; ROS 2: byte order, seconds, nanoseconds. Then the frame's name.
     (name_bytes,) = struct.unpack_from("<I", raw, 12)
     end = 16 + name_bytes
     return end + -end % 4 if ros2 else end
 
 
 def _event_array(path: Path, number: int, raw: bytes, ros2: bool) -> np.ndarray:
-    """The events of one message, without a copy but for the first one's in ROS 2, which lies differently."""
+    """The events of one message, without a copy for ROS 1; in ROS 2 the first event is aligned differently."""
     problem = f"{path}: message {number} of {len(raw)} bytes is no EventArray"
     try:
         if ros2 and raw[1] != 1:
@@ -171,7 +171,7 @@ def _evt3(path: Path, number: int, decoder: Decoder, packet: Any) -> Piece:
 
 
 def _mono(packet: Any, place: Callable[[int], str]) -> Piece:
-    """64 bits an event: nanoseconds since the packet's base, column, row, and in the last bit polarity."""
+    """64 bits per event: nanoseconds since the packet's base, column, row, and polarity in the last bit."""
     events = np.frombuffer(bytes(packet.events), _MONO_EVENT)
     t_us = (int(packet.time_base) + events["t_ns"].astype(np.int64) + 500) // 1000
     return Piece(events["x"], events["y_p"] & 0x7FFF, t_us, (events["y_p"] >> 15).astype(np.int8), place)
@@ -180,10 +180,10 @@ def _mono(packet: Any, place: Callable[[int], str]) -> Piece:
 def read_bag_frames(
     path: Path, size: tuple[int, int], topic: str | None, left_out: Counter[str]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Grey images of 8 or 16 bits, as large as the event sensor, with their times in microseconds; the rest is counted.
+    """Read 8- or 16-bit grey images of the event sensor's size with their times in microseconds; others are counted.
 
-    They are those of the topic whose name is most like that of the events' (of two sensors in a bag, either has its
-    own); of several, rather as the sensor took them than rectified, grey than colour, whole than compressed.
+    The topic with the longest name prefix in common with the events' topic is used (a bag may have two sensors); among
+    several, raw images are preferred to rectified ones, grey to colour, uncompressed to compressed.
     """
     with _opened(path) as bag:
         events = _of_events(path, bag, topic)[0].topic
@@ -221,7 +221,7 @@ def _first(bag: AnyReader, connections: list[Any], size: tuple[int, int]) -> _Fo
 
 
 def _empty_bits(bag: AnyReader, connections: list[Any], size: tuple[int, int], first: _Found | None) -> int:
-    """How many of 16 bits no picture uses: sensors of 10 or 12 bits write theirs so too, nearly black."""
+    """Number of upper bits of 16 that no picture uses: 10- and 12-bit sensors write nearly black images."""
     if not isinstance(first, tuple) or first[1].dtype != np.uint16:
         return 0
     found = (_picture(bag, raw, one, size) for one, _, raw in bag.messages(connections))
@@ -235,8 +235,8 @@ def _picture(bag: AnyReader, raw: bytes, connection: Any, size: tuple[int, int])
         stamp = image.header.stamp
         grey = _decompressed(image) if connection.msgtype == _COMPRESSED else _grey(image)
     except Exception:
-        # The library promises no kind of exception; a picture that is spoilt is no reason to refuse the events.
-        return f"cannot be taken apart, expected {connection.msgtype}"
+        # The library documents no exceptions; a damaged picture is no reason to refuse the events.
+        return f"cannot be parsed, expected {connection.msgtype}"
     if isinstance(grey, np.ndarray) and grey.shape != size[::-1]:
         grey = f"{grey.shape[1]} x {grey.shape[0]} pixels, expected the event sensor's {size[0]} x {size[1]}"
     return grey if isinstance(grey, str) else (stamp.sec * 10**6 + (stamp.nanosec + 500) // 1000, grey)
@@ -247,7 +247,7 @@ def _grey(image: Any) -> np.ndarray | str:
         return f"encoded as {image.encoding!r:.40}, expected one of {', '.join(_ENCODINGS)}"
     depth, channels, conversion = _ENCODINGS[image.encoding]
     width, height, length, used = image.width, image.height, len(image.data), image.width * channels * depth
-    # A row may be padded, but not by whole pictures: that is colour under a wrong name.
+    # A row may be padded, but not by its whole length, which indicates colour with a wrong encoding.
     if not (width and height and used <= image.step < 2 * used and length == image.step * height):
         return (
             f"{image.encoding} of {width} x {height} pixels in {length:,} bytes with rows of {image.step:,}, expected "

@@ -1,11 +1,12 @@
-"""ECF, the compression of Prophesee's HDF5 files: runs of equal times, rows and polarities, and packed numbers."""
+"""ECF, the compression of Prophesee's HDF5 files: run lengths of times, rows and polarities, and packed numbers."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from ebarf_ns.compiled import njit
 
 if TYPE_CHECKING:
     from jaxtyping import Int64, UInt8, UInt16
@@ -18,7 +19,7 @@ _MOST_EVENTS = 65535
 def decode(
     content: bytes,
 ) -> tuple[UInt16[np.ndarray, "n"], UInt16[np.ndarray, "n"], Int64[np.ndarray, "n"], UInt8[np.ndarray, "n"]]:
-    """Columns x, y, t [us] and polarity (0 or 1) of a block; raises :class:`ValueError` where it is none, or cut."""
+    """Decode x, y, t [us] and polarity (0 or 1) of a block; raises :class:`ValueError` if invalid or truncated."""
     if len(content) < _HEADER_BYTES:
         raise ValueError(f"an ECF block of {len(content)} bytes, expected {_HEADER_BYTES} or more")
     raw = np.frombuffer(content, np.uint8)
@@ -47,8 +48,8 @@ def decode(
 
 @njit(cache=True)
 def _times(raw, place, now_us, t_us):
-    """Bytes of a step (upper half) and a run's length (lower half, 15: two more bytes); or, where the upper half is 15,
-    a digit of a longer step, the lowest first."""
+    """Bytes of a time step (upper half) and a run length (lower half; 15: two more bytes follow); an upper half of 15
+    marks a digit of a longer step, lowest first."""
     i = 0
     while i < len(t_us):
         if place >= len(raw):
@@ -79,7 +80,7 @@ def _times(raw, place, now_us, t_us):
 
 @njit(cache=True, inline="always")
 def _word(raw, place, size):
-    """``size`` bytes, the lowest first."""
+    """Little-endian integer of ``size`` bytes."""
     value = np.int64(0)
     for k in range(size):
         value |= np.int64(raw[place + k]) << (8 * k)
@@ -88,7 +89,7 @@ def _word(raw, place, size):
 
 @njit(cache=True)
 def _runs(raw, place, size, bits, values):
-    """Words of ``size`` bytes: a value above the length of its run, of ``bits``; all ones: two more bytes say it."""
+    """Words of ``size`` bytes: a value above a run length of ``bits`` bits; all ones: two more bytes hold it."""
     i, most = 0, (1 << bits) - 1
     while i < len(values):
         if place < 0 or place + size > len(raw):
@@ -108,7 +109,7 @@ def _runs(raw, place, size, bits, values):
 
 @njit(cache=True)
 def _masked_columns(raw, place, x):
-    """Two bytes: a column above a mask of which of the next five follow."""
+    """Two bytes: a column above a 5-bit mask of the next five columns."""
     i = 0
     while i < len(x):
         if place < 0 or place + 2 > len(raw):
@@ -134,7 +135,7 @@ def _packed(raw, place, size, numbers):
             return -1
         a, b, c = _word(raw, place, size), _word(raw, place + size, size), _word(raw, place + 2 * size, size)
         place += 3 * size
-        # The second and third number lie across two words, their lower bits in the earlier one.
+        # The second and third numbers span two words, with their lower bits in the earlier one.
         second = a & ones | b >> 2 * quarter << quarter
         third = b & (1 << 2 * quarter) - 1 | c >> 3 * quarter << 2 * quarter
         four = (a >> quarter, second, third, c & (1 << 3 * quarter) - 1)

@@ -1,8 +1,8 @@
-"""HDF5 recordings of any layout: a group with a column each for x, y, time and polarity, or one table.
+"""HDF5 recordings of any layout: a group with one dataset each for x, y, time and polarity, or one table.
 
 TUM-VIE and DSEC have ``/events/{x,y,t,p}`` and ``/t_offset``, EDS the columns at top level, M3ED
 ``/prophesee/left/{x,y,t,p}``, Prophesee a compound table ``/CD/events``, v2e rows of four numbers
-``/events``. MATLAB 7.3's files are HDF5 as well, with columns that lie across.
+``/events``. MATLAB 7.3 files are HDF5 as well, with transposed columns.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
     guessed_unit,
+    inferred_order,
     integers,
     look_like_events,
     named,
+    sampled,
     spaced,
-    telling,
-    told_order,
     unit_of,
 )
 from ebarf_ns.formats.readers import ecf
@@ -36,20 +36,20 @@ with suppress(ImportError):
     import hdf5plugin  # noqa: F401  registers the compression filters of TUM-VIE and DSEC with HDF5
 
 _EVENTS_AT_ONCE = 1 << 20
-# What the library raises for one damage or another.
+# Exceptions of the library for damaged files.
 _DAMAGES = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
 _USUAL = "txyp"
 
 
 @dataclass(frozen=True)
 class _Column:
-    """A dataset of one dimension, or a part of one."""
+    """A one-dimensional dataset, or a column of a table."""
 
     data: h5py.Dataset
     field: str | None = None
-    """Of a compound table."""
+    """Field of a compound table."""
     index: int | None = None
-    """Of a matrix: which of its columns; which of its rows, where it lies across."""
+    """Column of a matrix, or row of a transposed one."""
     across: bool = False
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ class _Column:
 
 @dataclass(frozen=True)
 class _Events:
-    """Where the events are."""
+    """Location of the events."""
 
     columns: tuple[_Column, ...]
     time_name: str = ""
@@ -83,11 +83,11 @@ class _Events:
 def read_hdf5(
     path: Path, group: str | None = None, time_unit: TimeUnit | None = None, columns: str | None = None
 ) -> Source:
-    """The events of ``group``, or of the only group that has any; raises :class:`RecordingError`.
+    """Read the events of ``group``, by default the only one with events; raises :class:`RecordingError`.
 
-    Times are in the unit that their name says, as in ``t_ns``, else microseconds where they are whole numbers and
-    seconds where they are not, unless ``time_unit`` says otherwise; ``t_offset`` and Prophesee's compressed tables are
-    in microseconds. ``columns`` is the order of columns without names.
+    Unless ``time_unit`` is given, times are in the unit of their name, as in ``t_ns``, else microseconds if integer and
+    seconds if not; ``t_offset`` and Prophesee's compressed tables are in microseconds. ``columns`` is the order of
+    unnamed columns.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -95,7 +95,7 @@ def read_hdf5(
             size = _sensor_size(file, name)
             events = _events_of(file[name] if name else file)  # pyright: ignore[reportArgumentType]
             assert events is not None
-            order, unit, notes = _told(path, name, events, time_unit, columns)
+            order, unit, notes = _order_and_unit(path, name, events, time_unit, columns)
     except _DAMAGES as error:
         raise RecordingError(f"{path}: not a whole HDF5 file ({_one_line(error)})") from None
     guess = None if time_unit or unit_of(events.time_name) else unit
@@ -105,24 +105,24 @@ def read_hdf5(
     )
 
 
-def _told(
+def _order_and_unit(
     path: Path, name: str, events: _Events, time_unit: TimeUnit | None, columns: str | None
 ) -> tuple[str, TimeUnit, list[str]]:
-    """The order of columns without names, the unit of the times, and what tells them."""
+    """The order of unnamed columns, the time unit, and notes on how they were found."""
     order, notes = "", []
     if events.order is None:
-        order, how = (columns, "as stated") if columns else told_order(path, telling(events.columns), _USUAL)
+        order, how = (columns, "as stated") if columns else inferred_order(path, sampled(events.columns), _USUAL)
         notes.append(f"columns {spaced(order)}, {how}")
     _check(path, name, events.by_role(order))
     time = events.by_role(order)["t"]
-    t = telling([time])[0] if time.dtype.kind == "f" else np.zeros(0, np.int64)
+    t = sampled([time])[0] if time.dtype.kind == "f" else np.zeros(0, np.int64)
     unit = time_unit or unit_of(events.time_name) or guessed_unit(t)
     return order, unit, notes + coarseness(t, unit)
 
 
 def _groups(file: h5py.File, wanted: str | None) -> dict[str, _Events]:
-    """Where events are: groups with four columns, and compound tables with four fields; rows of four numbers where
-    there are none of those, or one is wanted."""
+    """Locations of events: groups with four columns and compound tables with four fields; rows of four numbers only if
+    there are none of those, or if a location is given."""
     found: dict[str, _Events] = {}
 
     def look(name: str, thing: h5py.Group | h5py.Dataset) -> None:
@@ -138,8 +138,8 @@ def _groups(file: h5py.File, wanted: str | None) -> dict[str, _Events]:
         return by_name
     if len(found) < 2:
         return found
-    # Matrices of poses and cameras have four columns as well.
-    return {name: events for name, events in found.items() if look_like_events(telling(events.columns))} or found
+    # Matrices of poses and cameras also have four columns.
+    return {name: events for name, events in found.items() if look_like_events(sampled(events.columns))} or found
 
 
 def _events_of(thing: h5py.Group | h5py.Dataset) -> _Events | None:
@@ -165,7 +165,7 @@ def _column(data: h5py.Dataset) -> _Column | None:
 
 
 def _matrix(data: h5py.Dataset) -> _Events | None:
-    """Rows of four numbers, or four rows of them."""
+    """A matrix with four columns, or four rows."""
     if data.ndim != 2 or 4 not in data.shape or data.dtype.kind not in "iubf":
         return None
     across = data.shape[1] != 4
@@ -192,14 +192,14 @@ def _listed(groups: dict[str, _Events]) -> str:
 
 
 def _sensor_size(file: h5py.File, name: str) -> tuple[int, int] | None:
-    """From attributes of the group or of the file, as several writers leave them."""
+    """Size from the attributes of the group or file, under the names of several writers."""
     for thing in (file[name] if name else file, file):
         attributes = {key.lower(): value for key, value in thing.attrs.items()}
         if "width" in attributes and "height" in attributes:
             return int(attributes["width"]), int(attributes["height"])
         size = attributes.get("sensor_resolution", attributes.get("resolution"))
         if size is not None and np.size(size) == 2:
-            # Both orders are in use; sensors are wider than high.
+            # Both orders are in use; sensors are wider than they are high.
             return int(np.max(size)), int(np.min(size))
     return None
 
@@ -224,7 +224,7 @@ def _pieces(path: Path, group: str, order: str, unit: TimeUnit) -> Iterator[Piec
 
 
 def _is_ecf(table: h5py.Dataset) -> bool:
-    """Whether a table is compressed as Prophesee does it, by a filter whose library no package brings."""
+    """Whether a table uses Prophesee's compression filter, which no package provides."""
     settings = table.id.get_create_plist()
     return any(settings.get_filter(k)[0] == ecf.FILTER for k in range(settings.get_nfilters()))
 
@@ -239,7 +239,7 @@ def _ecf_pieces(table: h5py.Dataset, offset_us: int) -> Iterator[Piece]:
             columns = rows["x"], rows["y"], rows["t"].astype(np.int64), rows["p"].astype(np.int8)
         else:
             columns = ecf.decode(content)
-        # The last chunk may be full of what is no event any more.
+        # The last chunk may be padded.
         count = min(size, len(table) - first)
         if len(columns[0]) < count:
             raise ValueError(f"the chunk at row {first:,} holds {len(columns[0]):,} of its {count:,} events")
@@ -263,7 +263,7 @@ def _check(path: Path, group: str, columns: dict[str, _Column]) -> None:
 
 
 def _microseconds(path: Path, group: str, t: np.ndarray, first: int, unit: TimeUnit) -> np.ndarray:
-    # Integers of microseconds always do.
+    # Integer microseconds always fit.
     if (t.dtype.kind == "f" or unit != "us") and not (possible := fits(t, unit)).all():
         row = int(possible.argmin())
         raise RecordingError(f"{path}: /{group} row {first + row:,} is at {t[row]} {unit}, expected a finite time")

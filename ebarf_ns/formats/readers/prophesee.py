@@ -1,7 +1,7 @@
-"""Prophesee's own files: ``.raw`` in the encodings EVT2, EVT2.1 and EVT3, and ``.dat``.
+"""Prophesee's file formats: ``.raw`` in the encodings EVT2, EVT2.1 and EVT3, and ``.dat``.
 
-Written after the format descriptions at docs.prophesee.ai (Data / Encoding Formats, File Formats). A ``.raw`` file has
-no checksums: what can be noticed is a word of a kind that does not exist, and a last word that is cut short.
+Follows the format descriptions at docs.prophesee.ai (Data / Encoding Formats, File Formats). A ``.raw`` file has no
+checksums: only words of an undefined type and a truncated last word can be detected.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import IO, Literal
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.formats.source import Piece, Source, numbered
 
@@ -25,23 +25,23 @@ _EVENTS_A_WORD: dict[Encoding, int] = {"evt2": 1, "evt2.1": 32, "evt3": 12}
 _BYTES_AT_ONCE = 1 << 20
 _LONGEST_HEADER = 1 << 16
 TIMELESS = "events before the first time word, whose time is unknown"
-"""Why some events of a stream are left out."""
-RESERVED = "words of reserved kinds, as padding is"
-"""Why some words of a stream are left out."""
+"""Reason for dropped events of a stream."""
+RESERVED = "words of reserved types, such as padding"
+"""Reason for dropped words of a stream."""
 _RESERVED_KINDS = np.isin(np.arange(16), (0x1, 0x9, 0xB, 0xC, 0xD))
 _MANY_RESERVED, _PADDINGS = 0.1, 4
-# What a decoder remembers from word to word.
+# State of a decoder between words.
 _TIME_HIGH, _TIME_LOW, _EPOCH, _Y, _X_BASE, _POLARITY, _TIMELESS_EVENTS, _STATE = range(8)
 _UNKNOWN = -1
 
 
 @dataclass
 class Decoder:
-    """Turns words of one encoding into events; what it has seen of time and rows carries over from call to call."""
+    """Decodes words of one encoding into events; the state of time and row persists between calls."""
 
     encoding: Encoding
     swapped_halves: bool = False
-    """EVT2.1 as sensors like IMX636 send it: the upper 32 bits of each word first."""
+    """EVT2.1 as sent by sensors like the IMX636: the upper 32 bits of each word come first."""
 
     def __post_init__(self):
         self._state = np.full(_STATE, _UNKNOWN, np.int64)
@@ -52,24 +52,24 @@ class Decoder:
 
     @property
     def timeless(self) -> int:
-        """Number of events so far that came before any time."""
+        """Number of events so far before the first time word."""
         return int(self._state[_TIMELESS_EVENTS])
 
     @property
     def dropped(self) -> dict[str, int]:
-        """What was left out so far, by reason."""
+        """Dropped words and events so far, by reason."""
         return {TIMELESS: self.timeless, RESERVED: self._reserved.total()}
 
     @property
     def cut_bytes(self) -> int:
-        """Bytes at the end that are no whole word."""
+        """Number of bytes of an incomplete word at the end."""
         return len(self._rest)
 
     def feed(self, content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """x, y, t_us and polarity (0, 1) of the events in some more bytes.
+        """Decode more bytes into x, y, t_us and polarity (0, 1) of their events.
 
-        Raises :class:`ValueError` with the number of the word for one of a kind that the encoding does not have. EVT3's
-        reserved kinds, which some cameras pad with, are left out, unless they are many and all different.
+        Raises :class:`ValueError` with the word's number for a type that the encoding does not have. EVT3's reserved
+        types, which some cameras use as padding, are dropped unless they are frequent and diverse.
         """
         word = np.dtype(_WORD[self.encoding])
         content = self._rest + content
@@ -89,13 +89,13 @@ class Decoder:
         )
         count, bad = _DECODERS[self.encoding](words, self._state, *columns)
         if bad >= 0:
-            raise ValueError(f"word {self.words + bad:,} is {int(words[bad]):#x}, no word of {self.encoding.upper()}")
+            raise ValueError(f"word {self.words + bad:,} is {int(words[bad]):#x}, not a {self.encoding.upper()} word")
         self.words += len(words)
         x, y, t_us, polarity = (column[:count].copy() for column in columns)
         return x, y, t_us, polarity
 
     def _check_reserved(self, words: np.ndarray) -> None:
-        """Count words of reserved kinds; what is no EVT3 has many, of all values, where padding has few or one."""
+        """Count words of reserved types; data other than EVT3 has many of diverse values, padding a few values."""
         reserved = _RESERVED_KINDS[words >> 12]
         if not reserved.any():
             return
@@ -105,12 +105,12 @@ class Decoder:
         if share > _MANY_RESERVED and len(self._reserved) > _PADDINGS:
             first = int(reserved.argmax())
             raise ValueError(
-                f"word {self.words + first:,} is {int(words[first]):#x}, no word of EVT3, and {share:.0%} are none"
+                f"word {self.words + first:,} is {int(words[first]):#x}, not an EVT3 word, like {share:.0%} of all"
             )
 
 
 def read_raw(path: Path) -> Source:
-    """A ``.raw`` file; raises :class:`RecordingError` where its header names no known encoding."""
+    """Read a ``.raw`` file; raises :class:`RecordingError` if its header names no known encoding."""
     header, begin = _header(path)
     encoding = _encoding(path, header)
     size = _size_of_raw(header)
@@ -140,13 +140,13 @@ def _raw_pieces(path: Path, begin: int, decoder: Decoder, dropped: Counter[str])
 
 
 def note_dropped(decoder: Decoder, dropped: Counter[str]) -> None:
-    """Set what a decoder has left out so far."""
+    """Copy a decoder's counts of dropped words and events."""
     for reason, count in decoder.dropped.items():
         dropped[reason] = count
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:
-    """The header's fields, lines ``% name value``, and where it ends."""
+    """The header's fields, from lines ``% name value``, and its end offset."""
     fields: dict[str, str] = {}
     with path.open("rb") as file:
         end = 0
@@ -228,7 +228,7 @@ def _decode_evt21(words, state, x, y, t_us, polarity):
 
 @njit(cache=True)
 def _decode_evt3(words, state, x, y, t_us, polarity):
-    """16-bit words, each of which changes one thing: the row, half of the time, or where a run of neighbours begins."""
+    """16-bit words, each of which sets one thing: the row, half of the time, or the start of a run of neighbours."""
     count = 0
     for i in range(len(words)):
         word = np.int64(words[i])
@@ -258,16 +258,16 @@ def _decode_evt3(words, state, x, y, t_us, polarity):
             state[_TIME_LOW] = payload
         elif kind == 0x8:
             if state[_TIME_HIGH] != payload:
-                # The low half that belongs to it comes next.
+                # The matching low half comes next.
                 state[_TIME_LOW] = 0
             _advance(state, payload, 12, 24)
-    # The other kinds are of the outside, go on with what they follow, or are reserved.
+    # The other types are external triggers, continuations, or reserved.
     return count, -1
 
 
 @njit(cache=True)
 def _advance(state, high, bits, all_bits):
-    """A new upper part of the time; one that is smaller by more than half its range has begun anew."""
+    """Set the upper part of the time; a decrease of more than half its range is an overflow."""
     if state[_TIME_HIGH] - high > (1 << (bits - 1)):
         state[_EPOCH] += 1 << all_bits
     state[_TIME_HIGH] = high
@@ -277,7 +277,7 @@ _DECODERS = {"evt2": _decode_evt2, "evt2.1": _decode_evt21, "evt3": _decode_evt3
 
 
 def read_dat(path: Path) -> Source:
-    """A ``.dat`` file of change events; raises :class:`RecordingError` for other kinds of it."""
+    """Read a ``.dat`` file of change detection events; raises :class:`RecordingError` for other event types."""
     header, begin = _header(path)
     with path.open("rb") as file:
         file.seek(begin)
@@ -305,7 +305,7 @@ def _dat_pieces(path: Path, begin: int, version: int, dropped: Counter[str]) -> 
             time, address = np.frombuffer(content[:whole], "<u4").reshape(-1, 2).astype(np.int64).T
             if not len(time):
                 return
-            # 32 bits of microseconds begin anew after 71 minutes.
+            # 32-bit microseconds overflow after 71 minutes.
             turns = np.cumsum(np.diff(time, prepend=before) < -(1 << 31), dtype=np.int64)
             t_us = time + epoch_us + (turns << 32)
             before, epoch_us = int(time[-1]), epoch_us + (int(turns[-1]) << 32)
@@ -318,7 +318,7 @@ def _dat_pieces(path: Path, begin: int, version: int, dropped: Counter[str]) -> 
 
 
 def _read_whole(file: IO[bytes], size: int) -> bytes:
-    """As many bytes as asked for, but at the end of the file."""
+    """Read ``size`` bytes, or fewer at the end of the file."""
     content = file.read(size)
     while len(content) < size and (more := file.read(size - len(content))):
         content += more

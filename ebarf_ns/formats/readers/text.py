@@ -1,8 +1,8 @@
-"""Events as text, a line each: exact decimal times, every malformed line named.
+"""Events as text, one per line: exact decimal times, every malformed line reported.
 
-``t x y p`` in any order that a line of names above them gives or their values tell, separated by blanks, commas or
-semicolons; a first line ``width height`` is rpg_e2vid's. Numbers may have points and exponents, as ``numpy.savetxt``
-writes them.
+``t x y p`` in any order, given by a header line or inferred from the values, separated by blanks, commas or semicolons;
+a first line ``width height`` is rpg_e2vid's. Numbers may have decimal points and exponents, as written by
+``numpy.savetxt``.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, spaced, told_order
+from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, inferred_order, spaced
 from ebarf_ns.formats.source import DECIMALS, Piece, Source, TimeUnit
 
 _BLOCK_BYTES = 1 << 22
@@ -35,22 +35,22 @@ _UNUSED = -1
 
 class _Layout(NamedTuple):
     roles: tuple[int, ...]
-    """Of each column."""
+    """Role of each column."""
     unit: TimeUnit
     guessed: bool
-    """Whether nothing but the look of the first times says so."""
+    """Whether the unit was only guessed from the first times."""
     sensor_size: tuple[int, int] | None
     header_lines: int
     order: str
-    """A letter each, where they have no names."""
+    """Order of unnamed columns, one letter each."""
     notes: tuple[str, ...]
 
 
 def read_text(path: Path, time_unit: TimeUnit | None = None, columns: str | None = None) -> Source:
-    """Columns are in the order of their names, of ``columns``, or that their values tell; usually ``t x y p``.
+    """Read events; the column order comes from a header, ``columns`` or the values, and is usually ``t x y p``.
 
-    Times are seconds where one of the first has a point or an exponent, but where all of these are whole numbers; else
-    microseconds. Their name or ``time_unit`` says otherwise.
+    Unless their name or ``time_unit`` gives a unit, times are seconds if the first ones have fractions, else
+    microseconds.
     Raises :class:`RecordingError` with file, line, text and expectation; nothing is repaired or dropped.
     """
     layout = _layout(path, time_unit, columns)
@@ -63,7 +63,7 @@ def read_text(path: Path, time_unit: TimeUnit | None = None, columns: str | None
 
 
 def _layout(path: Path, time_unit: TimeUnit | None, columns: str | None) -> _Layout:
-    """What the first lines say about the others."""
+    """Infer the layout from the first lines."""
     size, roles, unit = None, None, None
     lines = list(_first_lines(path))
     for place, (number, fields) in enumerate(lines):
@@ -76,7 +76,7 @@ def _layout(path: Path, time_unit: TimeUnit | None, columns: str | None) -> _Lay
             continue
         order, notes = "", ()
         if roles is None:
-            order, notes = _told(path, [fields for _, fields in lines[place:]], columns)
+            order, notes = _inferred_order(path, [fields for _, fields in lines[place:]], columns)
             roles = tuple(ROLES.index(role) for role in order)
         column = roles.index(_TIME)
         times = [fields[column] for _, fields in lines[place:] if column < len(fields)]
@@ -87,18 +87,18 @@ def _layout(path: Path, time_unit: TimeUnit | None, columns: str | None) -> _Lay
     raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
 
 
-def _told(path: Path, rows: list[list[str]], columns: str | None) -> tuple[str, tuple[str, ...]]:
-    """The order of columns without names, and what tells it."""
+def _inferred_order(path: Path, rows: list[list[str]], columns: str | None) -> tuple[str, tuple[str, ...]]:
+    """The order of unnamed columns, and a note on how it was found."""
     if columns:
         return columns, (f"columns {spaced(columns)}, as stated",)
     numbers = [[_decimal(field) for field in fields] for fields in rows]
     whole = list(itertools.takewhile(lambda row: len(row) == len(ROLES) and None not in row, numbers))
-    order, how = told_order(path, list(np.array(whole, float).reshape(-1, len(ROLES)).T), ROLES)
+    order, how = inferred_order(path, list(np.array(whole, float).reshape(-1, len(ROLES)).T), ROLES)
     return order, (f"columns {spaced(order)}, {how}",)
 
 
 def _guessed(times: list[str]) -> TimeUnit:
-    """By the first times: see :func:`read_text`."""
+    """Unit guessed from the first times, see :func:`read_text`."""
     numbers = [_decimal(time) for time in times]
     if not any(re.search("[.eE]", time) for time in times):
         return "us"
@@ -113,7 +113,7 @@ def _first_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                 if not line:
                     return
                 text = line.decode("utf-8-sig", errors="replace").split("#")[0].strip(" \t\r\n,;")
-                # A unit goes with its name: "time (us)".
+                # Join a unit with its name: "time (us)".
                 fields = re.split(r"[\s,;]+", re.sub(r"\s+(?=[\[(])", "", text))
                 if fields != [""]:
                     yield number, fields
@@ -152,7 +152,7 @@ def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
     roles = np.array(layout.roles)
     for block, line in _line_blocks(path, layout.header_lines):
         content = np.frombuffer(block, np.uint8)
-        # Fractions of what was taken for microseconds are seconds after all.
+        # A fractional time contradicts guessed microseconds.
         exact = layout.guessed and layout.unit == "us"
         table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], not exact, block.count(b"\n") + 1)
         if bad_line:
@@ -168,7 +168,7 @@ def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
 
 
 def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
-    """Blocks of whole lines, each with the number of its first line."""
+    """Blocks of whole lines, with the number of their first line."""
     line, rest = 1 + header_lines, b""
     with path.open("rb") as file:
         if file.read(len(_BYTE_ORDER_MARK)) != _BYTE_ORDER_MARK:
@@ -186,7 +186,7 @@ def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
 
 @njit(cache=True)
 def _parse(content, first_line, roles, time_decimals, round_times, most):
-    """Rows (t_us, x, y, p, line), and the number of the first malformed line or 0."""
+    """Parse rows (t_us, x, y, p, line); also returns the number of the first malformed line, or 0."""
     table = np.empty((most, _TABLE), np.int64)
     count = 0
     i, line = 0, first_line
@@ -220,7 +220,7 @@ def _parse(content, first_line, roles, time_decimals, round_times, most):
 
 @njit(cache=True)
 def _number(content, i, decimals, rounded):
-    """A number times 10**decimals, as an integer; where it is none, rounded or wrong."""
+    """Parse a number times 10**decimals as an integer; a fraction is rounded or makes it invalid."""
     negative = content[i] == 45  # '-'
     i += 1 if negative or content[i] == 43 else 0
     value, power, digits, seen, after_point = 0, decimals, 0, False, False

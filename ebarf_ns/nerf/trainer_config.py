@@ -1,0 +1,60 @@
+"""The flags of a training run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from ebarf_ns.errors import one_line_errors
+from ebarf_ns.nerf.checkpoints import newest_whole
+from ebarf_ns.nerf.settings_check import check_machine, check_settings
+
+
+@dataclass
+class EbarfTrainerConfig(TrainerConfig):
+    """A nerfstudio training run with a budget."""
+
+    max_train_seconds: float | None = None
+    """End after this many seconds of training, evaluation and loading excluded, if not after --max-num-iterations
+    steps before; all schedules follow."""
+    evaluations: int = 8
+    """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
+    overwrite: bool = False
+    """Begin anew in a folder that holds a run."""
+    allow_changed_scene: bool = False
+    """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
+    estimate_trajectory: bool = True
+    """Where the scene's trajectory is still to come, estimate it from the events first, and keep it with the scene."""
+    learn_intrinsics: bool = False
+    """Learn focal length, principal point and the camera's distortion coefficients too; the result is written to
+    camera_refined.json, as scene.json has it."""
+    averaged_steps: int = 100
+    """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
+
+    threads: int | None = None
+    """Of torch and numba; None: one for each core that nothing else keeps busy, or as OMP_NUM_THREADS says."""
+
+    def save_config(self) -> None:
+        """Look whether this machine has what is asked of it, which ns-train begins with.
+
+        The trainer writes config.yml, when it has the folder for itself and a plan.
+        """
+        with one_line_errors():
+            check_settings(self)
+            check_machine(self.machine)
+
+    def print_to_terminal(self) -> None:
+        """Config.yml has all of it; what matters is said as the plan."""
+
+    def get_checkpoint_dir(self) -> Path:
+        """Where checkpoints lie; scripts that open a run, and take the newest, are led past those that are damaged."""
+        folder = super().get_checkpoint_dir()
+        opened = self.pipeline.datamanager.dataparser.kept is not None  # pyright: ignore[reportAttributeAccessIssue]
+        if opened and self.load_dir is None and self.load_step is None and any(folder.glob("step-*.ckpt")):
+            with one_line_errors():
+                path, damaged = newest_whole(folder)
+            for error in damaged:
+                CONSOLE.print(f"{error}; {path.name} is taken")
+            self.load_step = int(path.stem.removeprefix("step-")) if damaged else None
+        return folder
