@@ -10,7 +10,11 @@ COMMANDS = {
     "inspect": "say what is in a scene or a recording, what looks wrong, and how it will be trained",
     "train": "train on a scene: ns-train ebarf --data SCENE, which has all the flags",
     "evaluate": "a finished run's errors, and its report made anew",
-    "trajectory": "compare trajectories, or give one errors",
+    "render": "pictures or a video along a run's trajectory, or the events that it predicts",
+    "mesh": "a run's surfaces as a mesh",
+    "points": "a run's surfaces as a point cloud",
+    "replay": "do the step again that ended a training with numbers that are not finite",
+    "trajectory": "estimate one from events alone, compare two, export a refined one, give one errors",
     "bench": "measure speed, or compare methods",
 }
 _LINES = "\n".join(f"  {name:<12}{does}" for name, does in COMMANDS.items())
