@@ -12,6 +12,7 @@ COMMANDS = {
     "evaluate": "a finished run's errors, and its report made anew",
     "trajectory": "compare trajectories, or give one errors",
     "bench": "measure speed, or compare methods",
+    "replay": "do the step again that ended a training by bad numbers, and say where they begin",
 }
 _LINES = "\n".join(f"  {name:<12}{does}" for name, does in COMMANDS.items())
 _HELP = f"""\
