@@ -16,6 +16,7 @@ COMMANDS = {
     "replay": "do the step again that ended a training with numbers that are not finite",
     "trajectory": "estimate one from events alone, compare two, export a refined one, give one errors",
     "bench": "measure speed, or compare methods",
+    "replay": "do the step again that ended a training by bad numbers, and say where they begin",
 }
 _LINES = "\n".join(f"  {name:<12}{does}" for name, does in COMMANDS.items())
 _HELP = f"""\
