@@ -28,6 +28,7 @@ from ebarf_ns.nerf.model import EbarfModel
 from ebarf_ns.scene import Frame, Scene
 
 # nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
+warnings.filterwarnings("ignore", message=".*GradScaler.*is deprecated", category=FutureWarning)
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
 warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True to a scalar")
 

@@ -96,12 +96,12 @@ def _begun(tracks: Tracks, focal_px: float, turned: Turned, first: int, last: in
     """A map of the keyframes between two, from the essential matrix of these."""
     one, two = (np.nonzero(tracks.image == image)[0] for image in (first, last))
     _, a, b = np.intersect1d(tracks.track[one], tracks.track[two], return_indices=True)
-    pixels = [focal_px * tracks.plane[rows] for rows in (one[a], two[b])]
+    at, then = focal_px * tracks.plane[one[a]], focal_px * tracks.plane[two[b]]
     matrix = np.diag([focal_px, focal_px, 1.0])
-    essential, inliers = cv2.findEssentialMat(*pixels, matrix, cv2.USAC_MAGSAC, 0.999, 1.5)
+    essential, inliers = cv2.findEssentialMat(at, then, matrix, cv2.USAC_MAGSAC, 0.999, 1.5)
     if essential is None or essential.shape != (3, 3):
         return None
-    _, rotation, translation, _ = cv2.recoverPose(essential, *pixels, matrix, mask=inliers)
+    _, rotation, translation, _ = cv2.recoverPose(essential, at, then, matrix, mask=inliers)
     count, known = len(turned.rotation), int(tracks.track.max()) + 1
     number = _SPARE * known
     tracks = Tracks(tracks.track.copy(), tracks.image, tracks.plane)
@@ -129,7 +129,7 @@ def _score(begun: Map) -> float:
     """Inliers' share, lessened where the whole has little parallax."""
     residual = begun.residuals_px()[begun.posed[begun.tracks.image]]
     images = np.nonzero(begun.posed)[0]
-    path = np.linalg.norm(begun.bundle.centre[images[-1]] - begun.bundle.centre[images[0]])
+    path = float(np.linalg.norm(begun.bundle.centre[images[-1]] - begun.bundle.centre[images[0]]))
     angle_px = begun.focal_px * path * float(np.median(begun.bundle.point[begun.pointed, 2]))
     return float((residual < _INLIER_PX / 2).mean()) ** 2 * min(angle_px, 2 * _ENOUGH_PX)
 

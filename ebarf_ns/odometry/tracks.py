@@ -76,7 +76,9 @@ def followed(images: Iterable[UInt8[np.ndarray, "height width"]], camera: Camera
     From picture to picture features are moved on, and drift; in each keyframe they are compared with an earlier one.
     """
     before, known = None, 0
-    features = _Features(np.zeros((0, 2), np.float32), *(np.zeros(0, np.int64),) * 2, np.zeros((0, 2), np.float32))
+    features = _Features(
+        np.zeros((0, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+    )
     keyframes: dict[int, np.ndarray] = {}
     found: list[tuple[np.ndarray, int, np.ndarray]] = []
     for k, picture in enumerate(images):
@@ -159,7 +161,7 @@ def _corners(picture: np.ndarray, taken: np.ndarray) -> np.ndarray:
     free = np.zeros(picture.shape, np.uint8)
     free[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = 255
     for x, y in taken:
-        cv2.circle(free, (round(float(x)), round(float(y))), _APART_PX, 0, -1)
+        cv2.circle(free, (round(float(x)), round(float(y))), _APART_PX, (0,), -1)
     room = _MOST_FEATURES - len(taken)
     if room <= 0:
         return np.zeros((0, 2), np.float32)

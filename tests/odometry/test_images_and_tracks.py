@@ -1,10 +1,12 @@
 """Event images without delay, clocks that follow the motion, and features followed to a fraction of a pixel."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from ebarf_ns.events.recording import joined
 from ebarf_ns.odometry.event_images import event_images
 from ebarf_ns.odometry.pace import paced
 from ebarf_ns.odometry.tracks import followed
@@ -25,8 +27,7 @@ def test_images_show_a_moving_square_where_it_is_from_the_first_moment_on(tmp_pa
 def test_the_clock_runs_with_the_events(tmp_path: Path):
     quick = noise(40_000, 500_000)
     slow = noise(8_000, 500_000)
-    both = type(quick)(*(np.concatenate([getattr(quick, n), getattr(slow, n)]) for n in ("x", "y")),
-                       np.r_[quick.t_us, slow.t_us + 500_000], np.r_[quick.polarity, slow.polarity])  # fmt: skip
+    both = joined([quick, replace(slow, t_us=slow.t_us + 500_000)])
     pace, hot = paced(recorded(tmp_path / "events.h5", both))
     assert not hot.any()
     at = pace.at(np.array([0, 250_000, 500_000, 750_000, 1_000_000]))
@@ -39,7 +40,7 @@ def test_the_clock_runs_with_the_events(tmp_path: Path):
 def test_features_follow_a_picture_that_shifts():
     random = np.random.default_rng(0)
     large = cv2.GaussianBlur(random.uniform(0, 255, (200, 260)).astype(np.float32), (0, 0), 2.0)
-    large = cv2.normalize(large, None, 0, 255, cv2.NORM_MINMAX)
+    large = 255 * (large - large.min()) / np.ptp(large)
     speed = np.array([1.3, -0.7])
     pictures = [
         cv2.warpAffine(large, np.array([[1, 0, -40 + k * speed[0]], [0, 1, -40 + k * speed[1]]]), (160, 120)).astype(
