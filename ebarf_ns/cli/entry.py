@@ -13,7 +13,6 @@ COMMANDS = {
     "render": "pictures or a video along a run's trajectory, or the events that it predicts",
     "mesh": "a run's surfaces as a mesh",
     "points": "a run's surfaces as a point cloud",
-    "replay": "do the step again that ended a training with numbers that are not finite",
     "trajectory": "estimate one from events alone, compare two, export a refined one, give one errors",
     "bench": "measure speed, or compare methods",
     "replay": "do the step again that ended a training by bad numbers, and say where they begin",
