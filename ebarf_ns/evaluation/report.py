@@ -224,7 +224,7 @@ def _moments(run: Path) -> str:
         return "<p>This run left none.</p>"
     return (
         "<p>Sums of polarities per pixel. Predicted: the change of the rendered log brightness over the window, in "
-        f"thresholds.</p><div>{_svg(moments_figure(moments))}</div>"
+        f"thresholds. Pixels that are blind after an event report fewer.</p><div>{_svg(moments_figure(moments))}</div>"
     )
 
 
