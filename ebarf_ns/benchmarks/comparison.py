@@ -137,8 +137,7 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
         if true is not None:
             _check_bounds_are_of_reference(scene, true)
         with whole_folder(made) as temporary:
-            # All other files stay where they are.
-            scene = replace(scene, folder=temporary, **stated)
+            scene = replace(_copied(scene, temporary), **stated)
             if true is not None and errors is not None:
                 trajectory = temporary / "trajectory.txt"
                 write_tum(trajectory, perturb(true, errors, job.seed))
@@ -146,6 +145,28 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
                 scene = replace(scene, trajectory=trajectory, bounds=bounds or None)
             write_scene(scene)
     return made, made_of
+
+
+def _copied(scene: Scene, folder: Path) -> Scene:
+    """The scene in another folder; its events, which alone are large, stay where they are."""
+
+    def copied(path: Path | None) -> Path | None:
+        if path is None:
+            return None
+        inside = path.is_relative_to(scene.folder)
+        copy = folder / (path.relative_to(scene.folder) if inside else path.name)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        return Path(shutil.copyfile(path, copy))
+
+    frames = (replace(frame, path=copied(frame.path), depth=copied(frame.depth)) for frame in scene.frames)
+    return replace(
+        scene,
+        folder=folder,
+        events=scene.events.absolute(),
+        trajectory=copied(scene.trajectory),
+        groundtruth=copied(scene.groundtruth),
+        frames=tuple(frames),
+    )
 
 
 def _stated(source: Stated) -> dict[str, Any]:
