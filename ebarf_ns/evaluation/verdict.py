@@ -28,7 +28,7 @@ class Verdict:
 def verdict(results: Mapping[str, Any], moved: tuple[float, float] | None = None) -> Verdict:
     """Of the last evaluation's numbers, and by how much (share of its extent, degrees) the trajectory was moved.
 
-    Held-out events decide: up to 30 % unexplained is good, beyond half is bad; and where they speak for the trajectory
+    Held-out events decide: up to 30 % unexplained is good, beyond half is bad; and where they support the trajectory
     as it was given, it is doubtful at best.
     """
     reasons, mark = [], "doubtful"
@@ -39,9 +39,9 @@ def verdict(results: Mapping[str, Any], moved: tuple[float, float] | None = None
     support = results.get("support") or {}
     if support.get("verdict") == "worse":
         mark = "doubtful" if mark == "good" else mark
-        reasons.append("held-out events speak for the trajectory as it was given, against the refined one")
+        reasons.append("held-out events support the trajectory as it was given, not the refined one")
     elif support.get("verdict") == "better":
-        reasons.append("held-out events speak for the refined trajectory, against the one given")
+        reasons.append("held-out events support the refined trajectory, not the one given")
     if results.get("inverted"):
         mark = "bad"
         reasons.append("pictures are inverted: bright where the frames are dark")

@@ -89,7 +89,7 @@ class EbarfModelConfig(ModelConfig):
     grid_table_size_log2: int | None = None
     """Rows of the table a level; None: as planned."""
     broad_cells: int | None = None
-    """Cells per side of the finest of the lattices that log brightness at large is learned in; 0: none; None: as
+    """Cells per side of the finest of the lattices for low-frequency log brightness; 0: none; None: as
     planned."""
     sampling: Literal["importance", "uniform"] = "importance"
     """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""

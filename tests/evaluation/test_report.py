@@ -37,12 +37,12 @@ def test_the_report_says_what_held_out_events_say(tmp_path: Path):
     keyframes = Trajectory(torch.arange(5) * 100_000, Poses(torch.rand(5, 3), torch.eye(4)[:1].expand(5, 4)))
     for name in ("trajectory_initial.txt", "trajectory_refined.txt"):
         write_tum(tmp_path / name, keyframes)
-    says = "events that were held out speak for the trajectory given\nleast certain is a tilt"
+    says = "held-out events support the given trajectory\nleast certain is a tilt"
     record = {"step": 1, "train_seconds": 1.0, "support": {"verdict": "worse", "says": says}}
     (tmp_path / "metrics.jsonl").write_text("\n".join(json.dumps(line) for line in [{}, record]))
     page = write_report(tmp_path, None).read_text()
     assert (
-        "speak for the trajectory given<br>least certain is a tilt" in page
+        "support the given trajectory<br>least certain is a tilt" in page
         and "speak for the trajectory as it was given" in page
     )
 
