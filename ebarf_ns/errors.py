@@ -43,6 +43,10 @@ class SimulationError(EbarfError):
     """The simulation was asked for something that it cannot make."""
 
 
+class ExportError(EbarfError):
+    """A run cannot be exported as it was asked for."""
+
+
 class BenchmarkError(EbarfError):
     """A benchmark was asked for something that cannot be measured."""
 

@@ -66,6 +66,15 @@ def whole_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def refuse_existing(folder: Path) -> None:
+    """Raise :class:`EbarfError` where a folder that is to be made would replace something."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise EbarfError(f"{folder}: exists, expected a new folder; remove it first where it is not needed")
+    # The finished folder takes the place of an empty one, which these cannot give up.
+    if folder.exists() and (os.path.ismount(folder) or folder.samefile(Path.cwd())):
+        raise EbarfError(f"{folder}: the current folder or a mounted one, expected a new folder, which may be in it")
+
+
 def is_special(path: Path) -> bool:
     """Whether a path names a pipe, a socket or a device: to read one may take for ever."""
     return path.exists() and not path.is_file() and not path.is_dir()

@@ -1,7 +1,6 @@
 """The ``ebarf`` command: arguments in, one call, a message out."""
 
 import json
-import os
 import sys
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -15,8 +14,10 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.cli.estimate_command import TrajectoryEstimate
+from ebarf_ns.cli.export_commands import Mesh, Points, Render, TrajectoryExport
 from ebarf_ns.cli.replay import Replay
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
+from ebarf_ns.files import refuse_existing
 from ebarf_ns.formats.process import Format, ProcessSettings
 from ebarf_ns.formats.source import TimeUnit
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
@@ -37,7 +38,7 @@ class Simulate:
         """Simulate with a progress bar."""
         from ebarf_ns.simulation.simulate import simulate
 
-        _refuse_existing(self.output)
+        refuse_existing(self.output)
         with Progress(transient=True, console=_stderr) as progress:
             task = progress.add_task("simulating", total=1.0)
             simulate(self.settings, self.output, lambda fraction: progress.update(task, completed=fraction))
@@ -65,7 +66,7 @@ class Process:
         """Make the scene and say what is in it."""
         from ebarf_ns.formats.process import process
 
-        _refuse_existing(self.output)
+        refuse_existing(self.output)
         source = self.folder or self.source
         if source is None:
             raise SceneError("no recording named, expected: ebarf process FORMAT SOURCE --output SCENE")
@@ -212,12 +213,13 @@ class Evaluate:
 
 @dataclass
 class Trajectory:
-    """Tools for trajectories in TUM format."""
+    """Compare, perturb and export trajectories."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[TrajectoryCompare, tyro.conf.subcommand("compare")]
         | Annotated[TrajectoryEstimate, tyro.conf.subcommand("estimate")]
         | Annotated[TrajectoryPerturb, tyro.conf.subcommand("perturb")]
+        | Annotated[TrajectoryExport, tyro.conf.subcommand("export")]
     ]
 
     def run(self) -> None:
@@ -299,14 +301,6 @@ def _print_json(content: dict[str, Any]) -> None:
     sys.stdout.write(json.dumps(content) + "\n")
 
 
-def _refuse_existing(output: Path) -> None:
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise SceneError(f"{output}: exists, expected a new folder; remove it first where it is not needed")
-    # The finished folder takes the place of an empty one, which these cannot give up.
-    if output.exists() and (os.path.ismount(output) or output.samefile(Path.cwd())):
-        raise SceneError(f"{output}: the current folder or a mounted one, expected a new folder, which may be in it")
-
-
 def _with_config(words: list[str]) -> list[str]:
     """The words of a command, those of the file that ``--config`` names before the others, which may overrule them."""
     # "--config=FILE" is the same.
@@ -340,6 +334,9 @@ def entrypoint() -> None:
                 "inspect": Inspect,
                 "trajectory": Trajectory,
                 "evaluate": Evaluate,
+                "render": Render,
+                "mesh": Mesh,
+                "points": Points,
                 "bench": Bench,
                 "replay": Replay,
             },

@@ -1,7 +1,9 @@
 """``ebarf train SCENE``: the short front of ``ns-train ebarf --data SCENE``."""
 
+import os
 import shlex
 import sys
+import warnings
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -29,6 +31,8 @@ def train(words: list[str]) -> None:
     if words[:1] in (["-h"], ["--help"]):
         print(_HELP, end="")
         return
+    # Before torch is loaded: threads that wait for each other leave their cores to other programs.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     with one_line_errors():
         if not words or words[0].startswith("-"):
             raise SceneError("no scene named, expected: ebarf train SCENE, and flags of ns-train ebarf after it")
@@ -40,6 +44,8 @@ def train(words: list[str]) -> None:
             raise EbarfError(
                 "no ns-train in this environment, expected nerfstudio 1.1.5: pip install nerfstudio==1.1.5"
             )
+    # Of torch and nerfstudio, about their own code.
+    warnings.filterwarnings("ignore", category=FutureWarning)
     sys.argv = command
     raise SystemExit(found.load()())
 

@@ -50,6 +50,7 @@ _NAMES: dict[str, tuple[str, str]] = {
     "peak_memory_mib": ("peak memory", "{:,.0f} MiB"),
 }
 _HEAD = '<meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+_MOST_RENDERS = 12
 _STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;max-width:62rem;margin:0 auto;padding:1rem;color:#222;background:#fff}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem;border-top:1px solid #ddd;padding-top:1rem}
@@ -204,8 +205,9 @@ def _renders(run: Path) -> str:
     paths = sorted((run / "renders").glob("*.png"))
     if not paths:
         return "<p>The scene has no frames to compare with. What held-out events say stands above.</p>"
-    figures = []
-    for path in paths:
+    chosen = paths[:: -(-len(paths) // _MOST_RENDERS)]
+    figures = [] if len(chosen) == len(paths) else [f"<p>{len(chosen)} of {len(paths)} frames.</p>"]
+    for path in chosen:
         picture, psnr = with_error_map(path)
         source = f"data:image/png;base64,{base64.b64encode(picture).decode()}"
         figures.append(
@@ -222,7 +224,7 @@ def _moments(run: Path) -> str:
         return "<p>This run left none.</p>"
     return (
         "<p>Sums of polarities per pixel. Predicted: the change of the rendered log brightness over the window, in "
-        f"thresholds.</p><div>{_svg(moments_figure(moments))}</div>"
+        f"thresholds. Pixels that are blind after an event report fewer.</p><div>{_svg(moments_figure(moments))}</div>"
     )
 
 

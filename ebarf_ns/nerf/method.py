@@ -55,7 +55,7 @@ def _trainer(
             },
         },
         # The trainer has a live line of its own.
-        logging=LoggingConfig(steps_per_log=10, local_writer=LocalWriterConfig(enable=False)),
+        logging=LoggingConfig(steps_per_log=10, profiler="none", local_writer=LocalWriterConfig(enable=False)),
         # Whoever reaches a viewer can drive it.
         viewer=ViewerConfig(num_rays_per_chunk=4096, websocket_host="127.0.0.1"),
         vis="viewer",

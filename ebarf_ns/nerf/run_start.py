@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import platform
+import shlex
+import sys
 from dataclasses import asdict, replace
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,6 +102,8 @@ def run_header(
     """The first line of ``metrics.jsonl``."""
     flags = flags_of(config)
     return {
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "date": date.today().isoformat(),
         "versions": {name: version(name) for name in ("ebarf_ns", "nerfstudio", "torch", "numpy")},
         "method": config.method_name,
         "device": torch.cuda.get_device_name() if device.startswith("cuda") else platform.processor() or "cpu",

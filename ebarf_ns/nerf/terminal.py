@@ -56,7 +56,7 @@ def errors_line(results: Results, given: Results) -> str:
     # Along a straight line, or without any shift, positions are aligned otherwise, or not at all.
     position = next((name for name in ("ate_m", "ate_m_orientation") if results.get(name) is not None), None)
     if position:
-        parts.append(f"position {_was(given, position, 100, '.2f')}{100 * results[position]:.2f} cm")
+        parts.append(f"position {_was(given, position, 100, '.3g')}{100 * results[position]:.3g} cm")
     if results.get("rotation_deg") is not None:
         parts.append(f"rotation {_was(given, 'rotation_deg', 1, '.2f')}{results['rotation_deg']:.2f}°")
     return "  ".join(parts)

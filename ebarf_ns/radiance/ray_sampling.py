@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _SHARE_OF_SEEN = 0.5
 _IN_ORDER = 16384
+_LEAST_WEIGHT = 1e-9
 
 
 class Rays(NamedTuple):
@@ -31,6 +32,19 @@ class Rendered(NamedTuple):
     depth: Float[Tensor, "rays"]
     accumulation: Float[Tensor, "rays"]
     """Opacity: share of the light that comes from the scene, not the background."""
+    weights: Float[Tensor, "rays samples"]
+    """Compositing weight of each interval."""
+    edges: Float[Tensor, "rays samples+1"]
+    """Distances of the interval edges."""
+
+    def depth_quantile(self, share: float) -> Float[Tensor, "rays"]:
+        """Distance before which this share of the compositing weight lies, the background's left out."""
+        total = torch.nn.functional.pad(self.weights.cumsum(-1), (1, 0))
+        total = total / total[:, -1:].clamp_min(_LEAST_WEIGHT)
+        upper = (total < share).sum(-1, keepdim=True).clamp(1, total.shape[-1] - 1)
+        below, above = total.gather(-1, upper - 1), total.gather(-1, upper)
+        start, end = self.edges.gather(-1, upper - 1), self.edges.gather(-1, upper)
+        return (start + (share - below) / (above - below).clamp_min(_LEAST_WEIGHT) * (end - start))[:, 0]
 
 
 def leave_box(rays: Rays, half_sides: Float[Tensor, "3"]) -> Float[Tensor, "rays"]:
@@ -166,4 +180,6 @@ def composite(
         (weights * intensity.view_as(middle)).sum(-1) + (1 - accumulation) * background,
         (weights * middle).sum(-1) + (1 - accumulation) * edges[:, -1],
         accumulation,
+        weights,
+        edges,
     )

@@ -15,7 +15,7 @@ RESULTS = {"heldout_event_loss": 0.4213, "psnr": 18.13, "ate_m": 0.021, "ate_m_o
 
 def test_errors_have_units_and_what_they_were():
     assert errors_line(RESULTS, GIVEN) == (
-        "unexplained events 42.1%  PSNR 18.1 dB  position 5.20 → 2.10 cm  rotation 2.79 → 0.81°"
+        "unexplained events 42.1%  PSNR 18.1 dB  position 5.2 → 2.1 cm  rotation 2.79 → 0.81°"
     )
 
 
@@ -24,7 +24,7 @@ def test_what_is_not_known_is_left_out():
         "unexplained events 10.0%"
     )
     straight = {**RESULTS, "ate_m": None}
-    assert "position 5.00 → 2.00 cm" in errors_line(straight, {**GIVEN, "ate_m": None})
+    assert "position 5 → 2 cm" in errors_line(straight, {**GIVEN, "ate_m": None})
 
 
 def test_scene_and_plan_are_a_line_each(tiny_scene: Path):
@@ -39,7 +39,7 @@ def test_scene_and_plan_are_a_line_each(tiny_scene: Path):
 
 def test_a_summary_names_every_place(tmp_path: Path):
     said = summary(tmp_path, 20.0, 51.0, RESULTS, GIVEN)
-    for word in ("5.20 → 2.10 cm", "20 s of training in 51 s", "report.html", "trajectory_refined.txt", "ns-viewer"):
+    for word in ("5.2 → 2.1 cm", "20 s of training in 51 s", "report.html", "trajectory_refined.txt", "ns-viewer"):
         assert word in said
     assert evaluation_line(5.2, 640, RESULTS, GIVEN).startswith("     5 s  step 640  unexplained events")
 

@@ -1,0 +1,1 @@
+"""A finished run as what other programs read: pictures, video, events, mesh, points, poses."""

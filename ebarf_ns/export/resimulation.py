@@ -1,0 +1,93 @@
+"""The recording as it should have been: what the sensor reports of the trained scene along the refined trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ebarf_ns.events.recording import Recording, RecordingFile, write_recording
+from ebarf_ns.export.pictures import span_us
+from ebarf_ns.simulation.record import record
+from ebarf_ns.simulation.view import View
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from jaxtyping import Float
+
+    from ebarf_ns.export.settings import Span
+    from ebarf_ns.export.subject import Subject
+
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class _Field:
+    """The trained scene as surroundings to cast rays into."""
+
+    subject: Subject
+
+    def cast(
+        self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]
+    ) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+        """What is as bright as the field, and how far away, in the trajectory's unit."""
+        seen = self.subject.see(origin, direction)
+        return np.exp(seen.brightness.astype(np.float64)), np.maximum(seen.distance.astype(np.float64), 1e-9)
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """The refined trajectory as a motion that begins at time 0."""
+
+    subject: Subject
+    start_us: int
+
+    def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """Camera centres, in the trajectory's unit."""
+        return self._matrices(t_us)[:, :, 3]
+
+    def rotation(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
+        """Camera-to-world rotations, OpenCV axes."""
+        return self._matrices(t_us)[:, :, :3]
+
+    def _matrices(self, t_us: np.ndarray) -> np.ndarray:
+        whole_us = torch.from_numpy(np.rint(t_us).astype(np.int64) + self.start_us)
+        return self.subject.poses_at(whole_us).matrix().double().numpy()
+
+
+def write_events(
+    subject: Subject, span: Span, path: Path, progress: Callable[[float], None] = lambda fraction: None
+) -> Recording:
+    """Write the events of a stretch of time in the layout of events.h5, and return them.
+
+    Raises :class:`ExportError` for impossible spans.
+    """
+    start_us, end_us = span_us(subject, span)
+    view = View(_Field(subject), _Refined(subject, start_us), subject.camera, rays_per_pixel=1)
+    events = record(view, subject.sensor, end_us - start_us, _SEED, progress)
+    events = replace(events, t_us=events.t_us + start_us)
+    write_recording(path, [events], source=path)
+    return events
+
+
+def recorded(subject: Subject, span: Span) -> Recording:
+    """What was recorded in that time; raises :class:`RecordingError` where it cannot be read."""
+    camera = subject.scene.camera
+    return RecordingFile(subject.scene.events, camera.width, camera.height).window(*span_us(subject, span))
+
+
+def agreement(predicted: Recording, real: Recording, width: int, height: int) -> dict[str, float]:
+    """Numbers of events, and how well their counts per pixel go together, brighter and darker apart: correlations."""
+    numbers: dict[str, float] = {"predicted": len(predicted), "recorded": len(real)}
+    for name, polarity in (("brighter", 1), ("darker", -1)):
+        counts = [
+            np.bincount(one.select(one.polarity == polarity).pixels(width), minlength=width * height)
+            for one in (predicted, real)
+        ]
+        varied = all(count.std() > 0 for count in counts)
+        numbers[f"{name}_correlation"] = float(np.corrcoef(counts)[0, 1]) if varied else 0.0
+    return numbers
