@@ -158,10 +158,7 @@ class TrajectoryCompare:
         from ebarf_ns.evaluation.compare import compare_files
 
         comparison = compare_files(self.estimate, self.reference, self.known)
-        if self.json:
-            _print_json(comparison)
-        else:
-            Console().print_json(data=comparison)
+        _print_json(comparison) if self.json else Console().print_json(data=comparison)
 
 
 @dataclass

@@ -36,7 +36,9 @@ _MEMORY_S, _KEYFRAME_S = (0.005, 0.3), (0.004, 0.1)
 """Shortest and longest time constant of event images, and time between keyframes."""
 _SHORTEST_TRACK, _FEWEST_TRACKS = 3, 20
 _LEAST_VIEW, _FEWEST_MAPPED, _LEAST_SPAN = 0.45, 100, 0.5
-_STILL_PX, _NO_PARALLAX_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.5
+_STILL_PX, _NO_PARALLAX_PX, _ROTATION_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.0, 1.5
+_LASTING = 0.3
+"""Share of the keyframes that a track must be seen in, on average, for a rotation to be told from a translation."""
 _LEAST_INLIERS = 0.6
 _LEAST_GAIN, _FAR = 1.5, 0.05
 """By how much a map must explain tracks better than a rotation does; and inverse depth over the usual one below which
@@ -110,7 +112,9 @@ def _judged(
             f"{file.path}: no motion, features stay within {max(parallax_px, turn_px):.1f} px; expected a camera that "
             "moves"
         )
-    if parallax_px < _NO_PARALLAX_PX:
+    # Where tracks are short, a rotation can follow what is a translation, and drift with it.
+    lasting = len(tracks.track) / len(rotation.track) >= _LASTING * len(t_us)
+    if parallax_px < _NO_PARALLAX_PX and lasting:
         return _of_rotation(tracks, t_us, rotation, focal_px, seen)
     whole = mapped(tracks, focal_px, rotation)
     found, gain, why = None, np.inf, f"no two keyframes begin a map; {_TRY_PARALLAX}"
@@ -140,7 +144,7 @@ def _judged(
             f"motion, expected {_FEWEST_MAPPED} over {_LEAST_SPAN:.0%}; objects that move by themselves, or too little "
             "texture?"
         )
-    if parallax_px < _LITTLE_PARALLAX_PX:
+    if parallax_px < _ROTATION_PX and (lasting or gain < _LEAST_GAIN):
         return _of_rotation(tracks, t_us, rotation, focal_px, seen)
     raise OdometryError(f"{file.path}: no trajectory to vouch for: {why}")
 
