@@ -27,6 +27,10 @@ class TrajectoryError(EbarfError):
     """The keyframe poses cannot be read, interpolated or aligned."""
 
 
+class OdometryError(EbarfError):
+    """No trajectory can be vouched for that events alone tell."""
+
+
 class TrainingError(EbarfError):
     """The training cannot go on."""
 

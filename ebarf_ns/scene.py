@@ -77,10 +77,10 @@ class Scene:
     """Files of validation frames that are named and are not there; such frames, or depths, are left out."""
 
 
-def read_scene(folder: Path) -> Scene:
+def read_scene(folder: Path, trajectory_to_come: bool = False) -> Scene:
     """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation.
 
-    Validation frames may be missing: nothing is learned from them.
+    Validation frames may be missing: nothing is learned from them. So may the trajectory, for who makes it.
     """
     path = folder / "scene.json"
     if not folder.is_dir():
@@ -97,7 +97,7 @@ def read_scene(folder: Path) -> Scene:
         folder=folder,
         # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
         events=content.file("events", must_exist=False, absolute=True),
-        trajectory=content.file("trajectory"),
+        trajectory=_trajectory(content, trajectory_to_come),
         camera=camera,
         groundtruth=content.optional_file("groundtruth"),
         frames=frames,
@@ -109,6 +109,16 @@ def read_scene(folder: Path) -> Scene:
         time_constant_us=_time_constant_us(content) if content.get("time_constant_us") is not None else None,
         bounds=_bounds(content) if content.get("bounds") is not None else None,
     )
+
+
+def _trajectory(content: JsonObject, to_come: bool) -> Path:
+    path = content.file("trajectory", must_exist=False)
+    if not to_come and not path.is_file():
+        raise SceneError(
+            f"{content.path}: trajectory names {path.name!r}, but there is no file {path}; expected one, or make it: "
+            f"ebarf trajectory estimate {content.path.parent}"
+        )
+    return path
 
 
 def check_bounds(scene: Scene, trajectory: Trajectory) -> None:

@@ -10,8 +10,12 @@ COMMANDS = {
     "inspect": "say what is in a scene or a recording, what looks wrong, and how it will be trained",
     "train": "train on a scene: ns-train ebarf --data SCENE, which has all the flags",
     "evaluate": "a finished run's errors, and its report made anew",
-    "trajectory": "compare trajectories, or give one errors",
+    "render": "pictures or a video along a run's trajectory, or the events that it predicts",
+    "mesh": "a run's surfaces as a mesh",
+    "points": "a run's surfaces as a point cloud",
+    "trajectory": "estimate one from events alone, compare two, export a refined one, give one errors",
     "bench": "measure speed, or compare methods",
+    "replay": "do the step again that ended a training by bad numbers, and say where they begin",
 }
 _LINES = "\n".join(f"  {name:<12}{does}" for name, does in COMMANDS.items())
 _HELP = f"""\

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
+from ebarf_ns.cli.estimate_command import TrajectoryEstimate
 from ebarf_ns.cli.export_commands import Mesh, Points, Render, TrajectoryExport
 from ebarf_ns.cli.replay import Replay
 from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
@@ -219,6 +220,7 @@ class Trajectory:
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[TrajectoryCompare, tyro.conf.subcommand("compare")]
+        | Annotated[TrajectoryEstimate, tyro.conf.subcommand("estimate")]
         | Annotated[TrajectoryPerturb, tyro.conf.subcommand("perturb")]
         | Annotated[TrajectoryExport, tyro.conf.subcommand("export")]
     ]

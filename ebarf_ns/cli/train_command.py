@@ -53,7 +53,10 @@ def _check(folder: Path) -> None:
         raise SceneError(
             f"{folder}: a file, expected a scene folder; ebarf process auto {folder} --output SCENE makes one"
         )
-    scene = read_scene(folder)
+    scene = read_scene(folder, trajectory_to_come=True)
+    if not scene.trajectory.is_file():
+        # Training makes one, and says so.
+        return
     trajectory = read_tum(scene.trajectory)
     check_bounds(scene, trajectory)
     _, start_us, end_us = RecordingFile(scene.events, scene.camera.width, scene.camera.height).span()

@@ -40,5 +40,5 @@ class SurfaceSettings:
     farthest: float | None = None
     """Leave out what is further from the camera than this."""
     blur: float = 0.08
-    """Leave out rays where half of the compositing weight is spread over more than this share of the depth: higher
-    means fewer holes and less exact surfaces."""
+    """Leave out rays where half of the compositing weight is spread over more than this share of the depth. Higher:
+    fewer holes, less exact surfaces."""

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import torch
 
-from ebarf_ns.errors import SceneError, TrajectoryError, did_you_mean
+from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
 from ebarf_ns.files import read_picture, whole_folder, write_picture
@@ -227,14 +227,15 @@ def _assemble(
         initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth, span_us)
         notes += said
     if initial is None:
-        raise TrajectoryError(f"{source.path}: no poses beside it, expected --trajectory with an odometry's keyframes")
-    notes += doubts(source, span_us, initial, intake.time_offset_us)
-    # With a time window or a given unit of event times, a mismatch is only a note.
-    intended = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
-    notes += apart(initial, span_us, settings.trajectory or source.path, intended)
-    initial = clipped(initial, span_us, settings.trajectory or source.path)
-    notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
-    write_tum(folder / "trajectory.txt", initial)
+        notes.append("no trajectory: ebarf trajectory estimate SCENE makes one from the events, as does training")
+    else:
+        notes += doubts(source, span_us, initial, intake.time_offset_us)
+        # With a time window or a given unit of event times, a mismatch is only a note.
+        intended = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
+        notes += apart(initial, span_us, settings.trajectory or source.path, intended)
+        initial = clipped(initial, span_us, settings.trajectory or source.path)
+        notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
+        write_tum(folder / "trajectory.txt", initial)
     if groundtruth is not None:
         groundtruth = clipped(groundtruth, span_us, settings.groundtruth or source.path)
         write_tum(folder / "groundtruth.txt", groundtruth)
@@ -259,14 +260,16 @@ def _assemble(
         groundtruth=folder / "groundtruth.txt" if groundtruth is not None else None,
         frames=tuple(frames),
         contrast_threshold=threshold or ingredients.contrast_threshold,
-        bounds=settings.bounds or (_seen(initial, camera, settings.farthest) if settings.farthest else None),
+        bounds=settings.bounds
+        or (_seen(initial, camera, settings.farthest) if settings.farthest and initial is not None else None),
     )
     write_scene(scene)
     contradicted = polarity_contradicted(polarity_correlations(scene))
     notes += [f"suspicious: {contradicted}"] if contradicted else []
     imported = "" if len(frames) == within else f", {len(frames)} imported"
     notes.append(
-        f"{len(initial.t_us)} keyframes around the events, {within} of {seen} frames within their span{imported}"
+        f"{len(initial.t_us) if initial else 'no'} keyframes around the events, "
+        f"{within} of {seen} frames within their span{imported}"
     )
     return report.sentences() + notes
 

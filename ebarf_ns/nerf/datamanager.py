@@ -83,8 +83,17 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     clock_offset_us = 0
     """What the trajectory's times are off by."""
 
+    def create_train_dataset(self) -> EventDataset:
+        """The keyframes' views."""
+        dataset = super().create_train_dataset()
+        # All are of one size. Of 100,000, nerfstudio would look at each, for minutes; it does so where this is set.
+        self._kept_outputs = self.train_dataparser_outputs
+        self.train_dataparser_outputs = None  # pyright: ignore[reportAttributeAccessIssue]
+        return dataset
+
     def setup_train(self) -> None:
         """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
+        self.train_dataparser_outputs = self._kept_outputs
         # Only a training asks for batches, and has planned them; ns-export says how many rays it wants.
         rays = self.config.train_num_rays_per_batch or 1024
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)

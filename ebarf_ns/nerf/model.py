@@ -177,7 +177,7 @@ class EbarfModel(Model):
             focal_px=scene.camera.fx,
         )
         self.intrinsics = Intrinsics(scene.camera) if config.learn_intrinsics else None
-        self.register_buffer("display_range", torch.tensor([-1.0, 1.0]))
+        self.register_buffer("display_range", torch.tensor([-1.0, 1.0]), persistent=False)
         """Log brightness that is shown as black and as white."""
         self.display_range: Tensor
         self.exposure, self.gamma = config.exposure, config.gamma

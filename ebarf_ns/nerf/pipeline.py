@@ -155,7 +155,10 @@ class EbarfPipeline(VanillaPipeline):
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Take the parameters of a checkpoint that is whole; what nerfstudio's scripts load comes this way too."""
         with one_line_errors():
-            super().load_pipeline(unsealed(loaded_state, f"step-{step:09d}.ckpt"), step)
+            state = unsealed(loaded_state, f"step-{step:09d}.ckpt")
+            # Earlier versions kept it; now it follows from the field.
+            state.pop("_model.display_range", None)
+            super().load_pipeline(state, step)
             self.datamanager.shift_clock(int(self.model.camera_optimizer.clock_offset_us))
         if self.test_mode != "val":
             self.datamanager.show_from(self._refined)

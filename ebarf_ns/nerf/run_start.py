@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.events.recording import RecordingFile
@@ -19,6 +20,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.nerf.dataparser import keep_scene, moved
 from ebarf_ns.nerf.machine import free_threads
 from ebarf_ns.nerf.metrics_file import changed_parts, config_digest, flags_of, scene_digest
+from ebarf_ns.odometry.output import complete_scene
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_backend
 from ebarf_ns.scene import Scene, check_bounds, read_scene
@@ -31,11 +33,13 @@ if TYPE_CHECKING:
 
 
 def read_scene_of(config: TrainerConfig) -> Scene:
-    """The scene that a configuration names; raises the package's errors."""
+    """The scene that a configuration names, with a trajectory; raises the package's errors."""
     datamanager: Any = config.pipeline.datamanager
     folder = Path(datamanager.data or datamanager.dataparser.data)
     if datamanager.dataparser.kept and not folder.is_dir():
         raise TrainingError(moved(replace(datamanager.dataparser, data=folder)))
+    if getattr(config, "estimate_trajectory", False):
+        complete_scene(folder, lambda sentence: CONSOLE.print(sentence, soft_wrap=True))
     return read_scene(folder)
 
 

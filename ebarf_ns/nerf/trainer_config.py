@@ -24,6 +24,8 @@ class EbarfTrainerConfig(TrainerConfig):
     """Begin anew in a folder that holds a run."""
     allow_changed_scene: bool = False
     """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
+    estimate_trajectory: bool = True
+    """Where the scene's trajectory is still to come, estimate it from the events first, and keep it with the scene."""
     learn_intrinsics: bool = False
     """Learn focal length, principal point and the camera's distortion coefficients too; the result is written to
     camera_refined.json, as scene.json has it."""

@@ -124,6 +124,16 @@ def test_a_full_disk_leaves_what_was_there_and_is_said_in_one_line(tmp_path: Pat
     assert read_checkpoint(step_path(tmp_path, 1))["step"] == 1
 
 
+def test_a_folder_that_cannot_be_written_is_one_line(
+    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as stopped:
+        trainer(config(tiny_scene, tmp_path / "file" / "runs"))
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert stopped.value.code == 2 and said.startswith("error: ") and said.endswith("Not a directory")
+
+
 def test_a_folder_has_one_writer_and_loses_what_a_killed_one_left_half_written(tmp_path: Path):
     first = take_folder(tmp_path, goes_on=False, overwrite=False)
     with pytest.raises(TrainingError, match="another training writes there"):

@@ -1,0 +1,120 @@
+"""What an estimate leaves on disk: the trajectory, its points, what it is worth; and the scene that it completes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from ebarf_ns.events.recording import RecordingFile
+from ebarf_ns.events.sensor_facts import identify_recording
+from ebarf_ns.files import whole_file
+from ebarf_ns.geometry.trajectory_file import write_tum
+from ebarf_ns.odometry.estimate import Estimate, estimated
+from ebarf_ns.odometry.settings import OdometrySettings
+from ebarf_ns.scene import Scene, read_scene, write_scene
+
+_BEYOND, _MARGIN = 0.02, 0.15
+"""Share of the points that are left out of the bounds at either end of an axis, and room around the others."""
+_FEWEST_FOR_BOUNDS = 50
+
+
+def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
+    """Give a scene folder whose trajectory.txt is still to come an estimated one, and bounds if it has none.
+
+    Raises :class:`~ebarf_ns.errors.OdometryError` where there is none to vouch for; the folder is left as it was.
+    """
+    scene = read_scene(folder, trajectory_to_come=True)
+    if scene.trajectory.is_file():
+        return
+    say(f"{scene.trajectory} is not there: estimating it from the events")
+    estimate = of_scene(scene, OdometrySettings())
+    write_estimate(estimate, scene.trajectory, scene)
+    for sentence in sentences(estimate):
+        say(sentence)
+
+
+def of_scene(scene: Scene, settings: OdometrySettings, progress: Callable[[str], None] = lambda step: None) -> Estimate:
+    """The estimate of a scene's recording, with the ratio of thresholds that the scene states or the events tell."""
+    file = RecordingFile(scene.events, scene.camera.width, scene.camera.height)
+    threshold = scene.contrast_threshold
+    if threshold is not None:
+        ratio = threshold.on / threshold.off
+    else:
+        ratio = identify_recording(file, file.span()[1:], scene.refractory_us).threshold_ratio.value
+    return estimated(file, scene.camera, settings, ratio, progress)
+
+
+def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = None) -> None:
+    """Write the trajectory as TUM text, and beside it points.ply and odometry.json; give the scene that it completes
+    bounds where it has none."""
+    quality = estimate.quality
+    comments = [
+        f"estimated from events alone: {quality.kind}; its unit is arbitrary",
+        f"{quality.tracks} tracks, reprojection error {quality.reprojection_px:.2f} px, "
+        f"{quality.span_share:.1%} of the recording's time",
+    ]
+    facts = {
+        **asdict(quality),
+        "t_us": estimate.trajectory.t_us.tolist(),
+        "position_std": [None if np.isnan(value) else value for value in estimate.position_std.tolist()],
+        "rotation_std_rad": estimate.rotation_std_rad.tolist(),
+    }
+    if len(estimate.points):
+        with whole_file(path.with_name("points.ply")) as temporary:
+            temporary.write_text(_ply(estimate.points), encoding="ascii")
+    with whole_file(path.with_name("odometry.json")) as temporary:
+        temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    if completed is not None and completed.bounds is None and (bounds := estimated_bounds(estimate)) is not None:
+        write_scene(replace(completed, bounds=bounds))
+    write_tum(path, estimate.trajectory, comments)
+
+
+def sentences(estimate: Estimate) -> list[str]:
+    """For people: the verdict first."""
+    quality, t_us = estimate.quality, estimate.trajectory.t_us
+    span = f"{int(t_us[0]) * 1e-6:.3f} to {int(t_us[-1]) * 1e-6:.3f} s, {quality.span_share:.1%} of the recording"
+    first = {
+        "six degrees of freedom": "verdict: positions and rotations, in an arbitrary unit",
+        "rotation only": "verdict: rotation only, positions are all zero: no parallax is seen",
+    }[quality.kind]
+    found = [
+        first,
+        f"{quality.keyframes} keyframes from {span}",
+        f"{quality.tracks} tracks over {quality.view_share:.0%} of the view, {quality.inlier_share:.0%} of what is "
+        f"seen of them explained, reprojection error {quality.reprojection_px:.2f} px",
+    ]
+    rotation_deg = np.degrees(estimate.rotation_std_rad)
+    turns = f"{np.median(rotation_deg):.2f} (at most {rotation_deg.max():.2f}) degrees"
+    if quality.disagreement is not None:
+        extent = np.ptp(estimate.trajectory.poses.position.numpy(), axis=0)
+        share = estimate.position_std / max(float(np.linalg.norm(extent)), 1e-12)
+        return [
+            *found,
+            f"uncertainty of a keyframe, by estimates from either half of the tracks: {np.median(share):.1%} (at most "
+            f"{share.max():.1%}) of the path's extent, {turns}",
+        ]
+    return [
+        *found,
+        f"uncertainty of a keyframe: {turns}; rotation alone leaves {quality.parallax_px:.1f} px unexplained",
+    ]
+
+
+def estimated_bounds(estimate: Estimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Corners of a box around the cameras and nearly all points; None where these are few."""
+    if len(estimate.points) < _FEWEST_FOR_BOUNDS:
+        return None
+    lower, upper = np.quantile(estimate.points, [_BEYOND, 1 - _BEYOND], axis=0)
+    cameras = estimate.trajectory.poses.position.numpy()
+    lower, upper = np.minimum(lower, cameras.min(axis=0)), np.maximum(upper, cameras.max(axis=0))
+    room = _MARGIN * float((upper - lower).max())
+    return tuple((lower - room).tolist()), tuple((upper + room).tolist())
+
+
+def _ply(points: np.ndarray) -> str:
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    return header + "".join(f"{x:.6g} {y:.6g} {z:.6g}\n" for x, y, z in points.tolist())
