@@ -1,7 +1,9 @@
 """The flags of a training run."""
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -9,6 +11,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ebarf_ns.errors import one_line_errors
 from ebarf_ns.nerf.checkpoints import newest_whole
 from ebarf_ns.nerf.settings_check import check_machine, check_settings
+
+_HOST_FLAG, _EVERYWHERE = "--viewer.websocket-host", "0.0.0.0"
 
 
 @dataclass
@@ -43,6 +47,16 @@ class EbarfTrainerConfig(TrainerConfig):
         with one_line_errors():
             check_settings(self)
             check_machine(self.machine)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Whoever reaches a viewer can drive it: it listens on loopback, unless a flag says otherwise.
+
+        ns-viewer puts its own settings here, which by default listen on all addresses.
+        """
+        said = any(word.replace("_", "-").startswith(_HOST_FLAG) for word in sys.argv)
+        if name == "viewer" and value.websocket_host == _EVERYWHERE and not said:
+            value = replace(value, websocket_host="127.0.0.1")
+        super().__setattr__(name, value)
 
     def print_to_terminal(self) -> None:
         """Config.yml has all of it; what matters is said as the plan."""

@@ -1,11 +1,15 @@
 """Threads by what other programs leave."""
 
+import copy
+
 import numba
 import psutil
 import pytest
 import torch
+from nerfstudio.configs.base_config import ViewerConfig
 
 from ebarf_ns.nerf.machine import Threads, free_threads, use_threads
+from ebarf_ns.nerf.method import ebarf
 
 
 @pytest.fixture(autouse=True)
@@ -13,10 +17,12 @@ def two_cores(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    own = psutil.Process().cpu_times()
+    monkeypatch.setattr(psutil.Process, "cpu_times", lambda _: own)
 
 
 @pytest.mark.parametrize(
-    "shares, count", [([0.0, 3.0], 2), ([30.0, 10.0], 2), ([90.0, 5.0], 1), ([100.0, 100.0], 1), ([60.0, 60.0], 1)]
+    "shares, count", [([0.0, 3.0], 2), ([30.0, 10.0], 2), ([92.0, 5.0], 1), ([100.0, 100.0], 1), ([60.0, 60.0], 1)]
 )
 def test_a_busy_core_is_left_to_others(monkeypatch: pytest.MonkeyPatch, shares: list[float], count: int):
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval, percpu: shares)
@@ -39,3 +45,14 @@ def test_torch_and_numba_follow(monkeypatch: pytest.MonkeyPatch):
     finally:
         torch.set_num_threads(before[0])
         numba.set_num_threads(before[1])
+
+
+@pytest.mark.parametrize("words, host", [([], "127.0.0.1"), (["--viewer.websocket-host", "0.0.0.0"], "0.0.0.0")])
+def test_a_viewer_listens_on_loopback_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], host: str
+):
+    """As ns-viewer does it, whose own default is all addresses."""
+    monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", "config.yml", *words])
+    config = copy.deepcopy(ebarf.config)
+    config.viewer = ViewerConfig(websocket_host="0.0.0.0")
+    assert config.viewer.websocket_host == host
