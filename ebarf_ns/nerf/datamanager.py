@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,6 +84,10 @@ class EventDataManager(VanillaDataManager[EventDataset]):
     clock_offset_us = 0
     """What the trajectory's times are off by."""
 
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.train_dataparser_outputs = self._kept_outputs
+
     def create_train_dataset(self) -> EventDataset:
         """The keyframes' views."""
         dataset = super().create_train_dataset()
@@ -93,7 +98,6 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     def setup_train(self) -> None:
         """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
-        self.train_dataparser_outputs = self._kept_outputs
         # Only a training asks for batches, and has planned them; ns-export says how many rays it wants.
         rays = self.config.train_num_rays_per_batch or 1024
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
