@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ebarf_ns.export.subject import Subject
 
 _SEED = 0
+_NEAREST_PERCENT = 5
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,13 @@ class _Field:
     def cast(
         self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]
     ) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
-        """What is as bright as the field, and how far away, in the trajectory's unit."""
+        """Radiance, and the distance that decides how often to render, in the trajectory's unit."""
         seen = self.subject.see(origin, direction)
-        return np.exp(seen.brightness.astype(np.float64)), np.maximum(seen.distance.astype(np.float64), 1e-9)
+        # A few rays that end in residual density near the camera would ask for a render every microsecond.
+        distance = (
+            np.maximum(seen.distance, np.percentile(seen.distance, _NEAREST_PERCENT)) if len(origin) else seen.distance
+        )
+        return np.exp(seen.brightness.astype(np.float64)), distance.astype(np.float64)
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,8 @@ def open_run(folder: Path) -> FinishedRun:
     pipeline: EbarfPipeline = config.pipeline.setup(device=device, test_mode="inference").eval()
     state = read_checkpoint(checkpoint)
     pipeline.load_pipeline(state["pipeline"], state["step"])
+    # Nothing is learned any more: a time constant of zero counts as no delay.
+    pipeline.requires_grad_(False)
     return FinishedRun(pipeline, _sensor(pipeline, folder))
 
 
