@@ -116,7 +116,7 @@ class EbarfModelConfig(ModelConfig):
         # All that ns-export marching-cubes does before its traceback is to look for this.
         if name == "sdf_field":
             with one_line_errors():
-                raise TrainingError("ns-export marching-cubes is for signed distance fields; expected ns-export tsdf")
+                raise TrainingError("ns-export marching-cubes is for signed distance fields; expected ebarf mesh RUN")
         raise AttributeError(name)
 
 
