@@ -132,9 +132,7 @@ def test_surfaces_of_the_demo_scene_are_true(demo_run: Path, tmp_path: Path, blu
         distance = distance_to_room(vertex)
         reached, _ = KDTree(vertex).query(np.concatenate(seen))
         print(f"{name}: {len(vertex)} at {np.median(distance):.4f} m, {np.mean(reached < 0.05):.2f} within 5 cm")
-        # A cloud is less exact than a mesh, whose surface is the mean of many views.
-        assert np.median(distance) < (median_m if name == "mesh" else 1.25 * median_m)
-        assert np.mean(reached < 0.05) > covered
+        assert np.median(distance) < median_m and np.mean(reached < 0.05) > covered
         # No walls along the cones of sight.
         assert np.percentile(distance, 99) < 0.3
 
