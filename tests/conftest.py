@@ -16,6 +16,10 @@ from hypothesis import settings
 
 from ebarf_ns.cli.entry import entrypoint
 
+# Before torch is loaded, here and in the commands that tests run: several processes share the cores, and threads that
+# spin while they wait for one another make steps twenty times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 # How long an example takes says more of what else the machine does than of the code.
 settings.register_profile("ebarf", deadline=None)
 settings.load_profile("ebarf")
