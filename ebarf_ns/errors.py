@@ -47,6 +47,10 @@ class ExportError(EbarfError):
     """A run cannot be exported as it was asked for."""
 
 
+class NoSurfaceError(ExportError):
+    """No surface is seen sharply enough."""
+
+
 class BenchmarkError(EbarfError):
     """A benchmark was asked for something that cannot be measured."""
 

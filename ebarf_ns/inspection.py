@@ -18,6 +18,7 @@ from ebarf_ns.geometry.smoothing import smoothed
 from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.geometry.trajectory_jumps import torn
+from ebarf_ns.machine import free_threads
 from ebarf_ns.plan import Line, plan_for
 from ebarf_ns.printing import print_facts, print_line
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
@@ -100,6 +101,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
     events, start_us, end_us = file.span()
     busiest = int(counts.argmax())
     facts = identify_recording(file, (first_us, last_us), scene.refractory_us)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     return Summary(
         events=events,
         width=camera.width,
@@ -126,7 +128,7 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
         groundtruth=scene.groundtruth is not None,
         distortion=camera.model if camera.distortion else "none",
         sensor=facts,
-        plan=plan_for(scene, smoothed(trajectory), events, "cuda" if torch.cuda.is_available() else "cpu", facts=facts),
+        plan=[*plan_for(scene, smoothed(trajectory), events, device, facts=facts), free_threads()],
     )
 
 

@@ -74,7 +74,8 @@ def test_nothing_is_called_that_windows_lacks():
 
 LACKING_WINDOWS = """
 import importlib, os, pkgutil, signal, sys
-import aedat, cv2, evo.core, h5py, hdf5plugin, matplotlib.pyplot, numba, rosbags.rosbag2, scipy, torch, triton, tyro
+import aedat, cv2, evo.core, h5py, hdf5plugin, matplotlib.pyplot, numba, psutil, rosbags.rosbag2, scipy, torch
+import triton, tyro
 import ebarf_ns
 names = {names}
 for module, name in names:

@@ -138,8 +138,10 @@ class TrajectoryExport:
         if folder:
             refuse_existing(output)
         with _opened(self.run_folder, "rendering") as (finished, progress):
-            count = export_trajectory(finished, self.format, output, self.rate_hz, progress)
-        _stderr.print(f"{count:,} poses: {output}", soft_wrap=True)
+            poses, points = export_trajectory(finished, self.format, output, self.rate_hz, progress)
+        if folder and not points:
+            _stderr.print("warning: no surface is seen sharply enough, the cloud of points is empty", soft_wrap=True)
+        _stderr.print(f"{poses:,} poses: {output}", soft_wrap=True)
 
 
 def _ply(path: Path) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ebarf_ns.errors import ExportError
 from ebarf_ns.export.views import Tone, look, scaled, tone_of
-from ebarf_ns.files import whole_file, whole_folder
+from ebarf_ns.files import whole_file, whole_folder, write_picture
 from ebarf_ns.geometry.trajectory_file import format_seconds
 
 if TYPE_CHECKING:
@@ -93,11 +93,9 @@ def write_pictures(
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> None:
     """8-bit PNG, grey linear in log brightness, by one black and one white for all."""
-    import cv2
-
     tone = _tone(subject, t_us)
     for k, one in enumerate(t_us.tolist()):
-        cv2.imwrite(str(folder / f"{FRAME_NAME.format(k)}.png"), tone.grey(look(subject, camera, one).brightness))
+        write_picture(folder / f"{FRAME_NAME.format(k)}.png", tone.grey(look(subject, camera, one).brightness))
         progress((k + 1) / len(t_us))
 
 
@@ -110,8 +108,10 @@ def _write_exr(subject: Subject, camera: Camera, t_us: np.ndarray, folder: Path,
         view = look(subject, camera, one)
         name = FRAME_NAME.format(k)
         for stem, image in ((name, np.exp(view.brightness)), (name.replace("frame", "depth"), view.depth)):
-            if not cv2.imwrite(str(folder / f"{stem}.exr"), image):
-                raise ExportError(f"{stem}.exr cannot be written: expected an OpenCV that knows EXR")
+            try:
+                write_picture(folder / f"{stem}.exr", image)
+            except cv2.error:
+                raise ExportError(f"{stem}.exr cannot be written: expected an OpenCV that knows EXR") from None
         progress((k + 1) / len(t_us))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from ebarf_ns.errors import ExportError
+from ebarf_ns.errors import ExportError, NoSurfaceError
 from ebarf_ns.export.fusion import Volume
 from ebarf_ns.export.views import Tone, View, bearings, evenly, look, tone_of
 from ebarf_ns.files import whole_file
@@ -52,7 +52,7 @@ def write_mesh(
         volume.add(view)
     mesh = volume.surface()
     if not len(mesh.face):
-        raise ExportError("no surface is seen sharply enough for a mesh, expected a longer training")
+        raise NoSurfaceError("no surface is seen sharply enough for a mesh, expected a longer training")
     grey = _tone(subject).grey(mesh.brightness)
     with whole_file(path) as temporary:
         trimesh.Trimesh(mesh.vertex, mesh.face, vertex_colors=_rgba(grey), process=False).export(temporary)
@@ -109,7 +109,7 @@ def _views(subject: Subject, settings: SurfaceSettings, progress: Callable[[floa
         views.append(replace(view, distance=np.where(sharp, view.distance, 0)))
         progress((k + 1) / len(t_us))
     if not any(view.distance.any() for view in views):
-        raise ExportError("no surface is seen sharply enough, expected a longer training")
+        raise NoSurfaceError("no surface is seen sharply enough, expected a longer training")
     return views
 
 

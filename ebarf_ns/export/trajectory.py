@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ebarf_ns.errors import ExportError
+from ebarf_ns.errors import ExportError, NoSurfaceError
 from ebarf_ns.export.pictures import FRAME_NAME, write_pictures, write_times
 from ebarf_ns.export.settings import SurfaceSettings
 from ebarf_ns.export.surface import Points, points, write_cloud
@@ -37,16 +38,18 @@ def export_trajectory(
     output: Path,
     rate_hz: float | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
-) -> int:
-    """Write poses of all keyframes, or at a rate between the first and the last; returns how many.
+) -> tuple[int, int]:
+    """Write poses of all keyframes, or at a rate between the first and the last; returns the numbers of poses, points.
 
     tum is a file; kitti a file with NAME_times.txt beside it; colmap and transforms are folders with rendered pictures,
-    of at most 300 keyframes where no rate is given, and a cloud of points. Raises :class:`ExportError`.
+    of at most 300 keyframes where no rate is given, and a cloud of points, which is empty where no surface is sharp.
+    Raises :class:`ExportError`.
     """
     pictures = format_ in ("colmap", "transforms")
     t_us = _times(subject, rate_hz, _MOST_PICTURES if pictures else _MOST_POSES)
     poses = subject.poses_at(torch.from_numpy(t_us))
     matrix = poses.matrix().double().numpy()
+    cloud = Points(np.empty((0, 3)), np.empty(0, np.uint8))
     if format_ == "tum":
         write_tum(output, Trajectory(torch.from_numpy(t_us), poses), ["camera to world, x right, y down, z forward"])
     elif format_ == "kitti":
@@ -59,13 +62,14 @@ def export_trajectory(
             (folder / "images").mkdir()
             write_pictures(subject, subject.camera, t_us, folder / "images", progress)
             write_times(folder / "timestamps.txt", t_us)
-            cloud = _some(points(subject, SurfaceSettings()))
-            write_cloud(cloud, folder / "points.ply")
+            with suppress(NoSurfaceError):
+                cloud = _some(points(subject, SurfaceSettings()))
+                write_cloud(cloud, folder / "points.ply")
             if format_ == "colmap":
                 _write_colmap(subject.camera, matrix, cloud, folder / "sparse" / "0")
             else:
                 _write_transforms(subject.camera, matrix, t_us, folder)
-    return len(t_us)
+    return len(t_us), len(cloud.position)
 
 
 def _times(subject: Subject, rate_hz: float | None, most: int) -> Int64[np.ndarray, "poses"]:
@@ -92,17 +96,18 @@ def _write_colmap(camera: Camera, matrix: Float[np.ndarray, "poses 3 4"], cloud:
     name, parameters = _colmap_camera(camera)
     numbers = " ".join(f"{value:.9g}" for value in parameters)
     (folder / "cameras.txt").write_text(
-        f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {name} {camera.width} {camera.height} {numbers}\n"
+        f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {name} {camera.width} {camera.height} {numbers}\n",
+        encoding="utf-8",
     )
     to_camera = Rotation.from_matrix(matrix[:, :, :3]).inv()
     shift = -to_camera.apply(matrix[:, :, 3])
     rows = np.hstack([to_camera.as_quat()[:, [3, 0, 1, 2]], shift])
-    with (folder / "images.txt").open("w") as file:
+    with (folder / "images.txt").open("w", encoding="utf-8") as file:
         file.write("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[]: none\n")
         for k, row in enumerate(rows.tolist()):
             pose = " ".join(f"{value:.9f}" for value in row)
             file.write(f"{k + 1} {pose} 1 {FRAME_NAME.format(k)}.png\n\n")
-    with (folder / "points3D.txt").open("w") as file:
+    with (folder / "points3D.txt").open("w", encoding="utf-8") as file:
         file.write("# POINT3D_ID X Y Z R G B ERROR TRACK[]: none\n")
         for k, (position, grey) in enumerate(zip(cloud.position.tolist(), cloud.grey.tolist(), strict=True)):
             x, y, z = position
@@ -133,7 +138,7 @@ def _write_transforms(
         "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy,
         "cx": camera.cx + 0.5, "cy": camera.cy + 0.5,
         **dict(zip(names, camera.distortion, strict=False)),
-        "ply_file_path": "points.ply",
+        **({"ply_file_path": "points.ply"} if (folder / "points.ply").exists() else {}),
         "frames": [
             {"file_path": f"images/{FRAME_NAME.format(k)}.png", "transform_matrix": pose, "t_us": one}
             for k, (pose, one) in enumerate(zip(whole.tolist(), t_us.tolist(), strict=True))

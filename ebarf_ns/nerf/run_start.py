@@ -20,8 +20,8 @@ from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.machine import free_threads
 from ebarf_ns.nerf.dataparser import keep_scene, moved
-from ebarf_ns.nerf.machine import free_threads
 from ebarf_ns.nerf.metrics_file import changed_parts, config_digest, flags_of, scene_digest
 from ebarf_ns.odometry.output import complete_scene
 from ebarf_ns.plan import Line, apply_plan, plan_for
@@ -76,8 +76,7 @@ def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str,
     normalized = model.loss == "normalized"
     kind = "cuda" if device.startswith("cuda") else "cpu"
     lines = plan_for(scene, start, events, kind, model.grid_coarsest, model.grid_finest, normalized, facts)
-    threads = free_threads()
-    lines.append(Line("threads", threads.count, threads.reason))
+    lines.append(free_threads())
     resumed = {
         field: Line(field, made["value"], "as in the run resumed") for field, made in header.get("plan", {}).items()
     }

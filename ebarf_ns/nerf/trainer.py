@@ -17,12 +17,12 @@ from ebarf_ns.errors import TrainingError, one_line_errors
 from ebarf_ns.evaluation.report import write_report
 from ebarf_ns.evaluation.trajectory_error import trajectory_results
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
+from ebarf_ns.machine import use_threads
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.averaging import Averaging
 from ebarf_ns.nerf.checkpoints import chosen_checkpoint, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.guard import GuardedOptimizers
-from ebarf_ns.nerf.machine import use_threads
 from ebarf_ns.nerf.metrics_file import begin_metrics, flags_of, read_header
 from ebarf_ns.nerf.moments import write_moments
 from ebarf_ns.nerf.optimizers import BudgetDecay

@@ -75,7 +75,8 @@ def test_the_block_of_an_own_recording_runs(tiny_scene: Path, tmp_path: Path):
     shutil.copy(scene.trajectory, tmp_path / "odometry.txt")
     for line in block:
         words = shlex.split(line)
-        quick = [*TINY_TRAINING, "--max-num-iterations=20", "--vis=tensorboard"] if words[0] == "ns-train" else []
+        trains = words[0] == "ns-train" or words[:2] == ["ebarf", "train"]
+        quick = [*TINY_TRAINING, "--max-num-iterations=20", "--vis=tensorboard"] if trains else []
         run_ok(*words, *quick, cwd=tmp_path)
     made = read_recording(tmp_path / "my_scene" / "events.h5", camera.width, camera.height)
     assert (made.t_us == events.t_us).all() and (made.polarity == events.polarity).all()
@@ -87,8 +88,10 @@ def test_a_run_is_looked_at_as_the_readme_says(trained_run: Path, tmp_path: Path
     shutil.copytree(trained_run, run)
     for line in block:
         words = shlex.split(line.replace("RUN", str(run)))
+        # After 80 steps surfaces are still a fog.
+        coarse = ["--blur=1"] if words[:2] == ["ebarf", "mesh"] else []
         if words[0] != "ns-viewer":
-            run_ok(*words, cwd=tmp_path)
+            run_ok(*words, *coarse, cwd=tmp_path)
     made = sorted(path.relative_to(run / "exports").as_posix() for path in (run / "exports").rglob("*"))
     assert any(name.endswith(".mp4") for name in made) and any(name.endswith(".ply") for name in made)
     assert any(name.endswith("images.txt") for name in made)

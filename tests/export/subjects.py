@@ -46,6 +46,13 @@ class KnownRoom:
         return Seen(*(column.astype(np.float32) for column in (np.log(radiance), distance, spread, accumulation)))
 
 
+class FoggyRoom(KnownRoom):
+    """The truth through a fog, as after a short training: no surface is sharp."""
+
+    def see(self, origin: np.ndarray, direction: np.ndarray) -> Seen:
+        return super().see(origin, direction)._replace(spread=np.full(len(origin), 0.5, np.float32))
+
+
 def distance_to_room(point: np.ndarray, room: Room = ROOM) -> np.ndarray:
     """Of points to the nearest true surface, in metres."""
     lower, upper = np.array(room.lower), np.array(room.upper)

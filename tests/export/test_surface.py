@@ -13,7 +13,17 @@ from ebarf_ns.export.surface import points, without_distortion, write_mesh, writ
 from ebarf_ns.export.views import tone_of
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.scene import Scene
-from tests.export.subjects import FISHEYE, PINHOLE, RADTAN, ROOM, KnownRoom, distance_to_room, read_ply, true_points
+from tests.export.subjects import (
+    FISHEYE,
+    PINHOLE,
+    RADTAN,
+    ROOM,
+    FoggyRoom,
+    KnownRoom,
+    distance_to_room,
+    read_ply,
+    true_points,
+)
 
 COARSE = SurfaceSettings(voxel=0.05)
 
@@ -61,12 +71,8 @@ def test_what_is_far_or_blurred_is_left_out(known: KnownRoom):
     near = points(known, replace(COARSE, farthest=2.0))
     reach = np.linalg.norm(near.position - np.array([-1.0, 0.0, 0.4]), axis=1)
     assert reach.max() < 3.2 < np.linalg.norm(points(known, COARSE).position - [-1.0, 0.0, 0.4], axis=1).max()
-    sharp = known.see
-    known.see = lambda origin, direction: sharp(origin, direction)._replace(
-        spread=np.full(len(origin), 0.5, np.float32)
-    )
     with pytest.raises(ExportError, match="sharply enough"):
-        points(known, COARSE)
+        points(FoggyRoom(known.scene), COARSE)
 
 
 @pytest.mark.parametrize(

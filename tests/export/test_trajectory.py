@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from ebarf_ns.errors import ExportError
 from ebarf_ns.export.trajectory import export_trajectory
 from ebarf_ns.geometry.cameras import Camera
 from ebarf_ns.scene import Scene
-from tests.export.subjects import FISHEYE, PINHOLE, RADTAN, KnownRoom
+from tests.export.subjects import FISHEYE, PINHOLE, RADTAN, FoggyRoom, KnownRoom
 
 CAMERAS = pytest.mark.parametrize("camera", [PINHOLE, RADTAN, FISHEYE], ids=lambda camera: camera.model)
 
@@ -26,7 +26,7 @@ def matrices(subject: KnownRoom) -> np.ndarray:
 
 @pytest.mark.parametrize("rate_hz", [None, 1000.0])
 def test_evo_reads_tum(known: KnownRoom, tmp_path: Path, rate_hz: float | None):
-    count = export_trajectory(known, "tum", tmp_path / "out.txt", rate_hz)
+    count, _ = export_trajectory(known, "tum", tmp_path / "out.txt", rate_hz)
     read = file_interface.read_tum_trajectory_file(str(tmp_path / "out.txt"))
     assert read.num_poses == count == (21 if rate_hz is None else 1001)
     t_us = torch.from_numpy((read.timestamps * 1e6).round().astype(np.int64))
@@ -114,6 +114,18 @@ def test_frames_know_their_time(known: KnownRoom, tmp_path: Path):
     export_trajectory(known, "transforms", tmp_path / "out", rate_hz=5)
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert [frame["t_us"] for frame in frames] == [1_000_000, 1_200_000, 1_400_000, 1_600_000, 1_800_000, 2_000_000]
+
+
+@pytest.mark.parametrize("format_", ["colmap", "transforms"])
+def test_poses_and_pictures_are_exported_where_no_surface_is_sharp(
+    scene: Scene, format_: Literal["colmap", "transforms"], tmp_path: Path
+):
+    assert export_trajectory(FoggyRoom(scene, keyframes=4), format_, tmp_path / "out") == (4, 0)
+    assert len(list((tmp_path / "out" / "images").iterdir())) == 4
+    if format_ == "colmap":
+        assert len((tmp_path / "out" / "sparse" / "0" / "points3D.txt").read_text().splitlines()) == 1
+    else:
+        assert "ply_file_path" not in json.loads((tmp_path / "out" / "transforms.json").read_text())
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), 1e9])

@@ -27,7 +27,7 @@ class Mutation(NamedTuple):
 SO3, TRAJECTORY = "ebarf_ns/geometry/so3.py", "ebarf_ns/geometry/trajectory.py"
 BRIGHTNESS, LOSS = "ebarf_ns/photometry/brightness.py", "ebarf_ns/photometry/event_loss.py"
 RECORDING, PAIRS = "ebarf_ns/events/recording.py", "ebarf_ns/events/pairs.py"
-OPTIMIZERS, MODEL = "ebarf_ns/nerf/optimizers.py", "ebarf_ns/nerf/model.py"
+GUARD, MODEL = "ebarf_ns/nerf/guard.py", "ebarf_ns/nerf/model.py"
 FRACTION = "(t_us - keyframe_t_us[left]).double() / interval_us.double()"
 SAFE = "torch.where(small, torch.ones_like(angle_squared), angle_squared)"
 SINC = """    angle = torch.where(small, torch.ones_like(angle_squared), angle_squared).sqrt()
@@ -90,7 +90,7 @@ MUTATIONS = (
              "test_photometry.py::test_case_18_which_end_comes_first_does_not_matter"),
     Mutation(19, LOSS, NO_INFORMATION, "if False:",
              "test_photometry.py::test_case_19_batches_without_information_change_nothing"),
-    Mutation(20, PAIRS, "np.where(hot, 0, counts)", "counts",
+    Mutation(20, "ebarf_ns/events/indexing.py", "np.where(hot, 0, counts)", "counts",
              "test_photometry.py::test_case_20_a_hot_pixel_with_a_million_events_has_no_more_than_its_share_of_a_batch"),
     Mutation(21, PAIRS, "        steps = np.minimum(steps, self.max_steps)\n", "",
              "test_photometry.py::test_case_21_pairs_of_any_length_have_finite_losses"),
@@ -106,9 +106,9 @@ MUTATIONS = (
              "test_training.py::test_case_25_a_full_disk_leaves_the_older_checkpoint"),
     Mutation(26, MODEL, "self.random.manual_seed(seed * 1_000_003 + step)", "pass",
              "test_training.py::test_case_26_a_run_resumed_in_another_process_ends_bitwise_where_an_uninterrupted_one_does"),
-    Mutation(27, OPTIMIZERS, "bool(norms.isfinite().all())", "True",
+    Mutation(27, GUARD, "bool(norms.isfinite().all())", "True",
              "test_training.py::test_case_27_a_step_with_a_broken_gradient_changes_nothing"),
-    Mutation(28, OPTIMIZERS, " if parameter.grad is not None]", "]",
+    Mutation(28, GUARD, " if parameter.grad is not None]", "]",
              "test_training.py::test_case_28_poses_without_gradients_under_mixed_precision_do_not_end_the_run"),
     Mutation(29, MODEL, "            config.near,\n", "            0.05,\n",
              "test_training.py::test_case_29_every_field_of_the_configuration_changes_the_run[near]"),

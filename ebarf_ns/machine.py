@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 import numba
 import psutil
 import torch
 
+from ebarf_ns.plan import Line
+
 _LOOK_S = 0.3
 _BUSY_CORE = 0.5
 
 
-@dataclass(frozen=True)
-class Threads:
-    """A number of threads and the reason for it."""
-
-    count: int
-    reason: str
-
-
-def free_threads() -> Threads:
-    """What a look of 0.3 s at the processor says; what OMP_NUM_THREADS says stands.
+def free_threads() -> Line:
+    """The plan's number of threads, from how busy the processor is during 0.3 s; OMP_NUM_THREADS takes precedence.
 
     Threads that wait for each other spin. Where one of them has to share its core, all the others wait for it, and a
     step takes twenty times as long as with one thread less.
     """
     most = min(torch.get_num_threads(), numba.get_num_threads())
     if "OMP_NUM_THREADS" in os.environ:
-        return Threads(most, "OMP_NUM_THREADS says so")
+        return Line("threads", most, "OMP_NUM_THREADS says so")
     before = psutil.Process().cpu_times()
     shares = psutil.cpu_percent(interval=_LOOK_S, percpu=True)
     after = psutil.Process().cpu_times()
@@ -37,7 +30,7 @@ def free_threads() -> Threads:
     busy = max(sum(shares) / 100 - own, 0.0)
     taken = int(busy + 1 - _BUSY_CORE)
     count = max(min(most, len(shares) - taken), 1)
-    return Threads(count, f"{len(shares)} cores, {busy:.1f} of them busy with other work")
+    return Line("threads", count, f"{len(shares)} cores, {busy:.1f} of them busy with other work")
 
 
 def use_threads(count: int | None) -> None:

@@ -8,8 +8,9 @@ import pytest
 import torch
 from nerfstudio.configs.base_config import ViewerConfig
 
-from ebarf_ns.nerf.machine import Threads, free_threads, use_threads
+from ebarf_ns.machine import free_threads, use_threads
 from ebarf_ns.nerf.method import ebarf
+from ebarf_ns.plan import Line
 
 
 @pytest.fixture(autouse=True)
@@ -27,13 +28,13 @@ def two_cores(monkeypatch: pytest.MonkeyPatch):
 def test_a_busy_core_is_left_to_others(monkeypatch: pytest.MonkeyPatch, shares: list[float], count: int):
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval, percpu: shares)
     found = free_threads()
-    assert found.count == count and f"{sum(shares) / 100:.1f} of them busy" in found.reason
+    assert found.value == count and f"{sum(shares) / 100:.1f} of them busy" in found.reason
 
 
 def test_what_the_environment_says_stands(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval, percpu: [100.0, 100.0])
-    assert free_threads() == Threads(2, "OMP_NUM_THREADS says so")
+    assert free_threads() == Line("threads", 2, "OMP_NUM_THREADS says so")
 
 
 def test_torch_and_numba_follow(monkeypatch: pytest.MonkeyPatch):
