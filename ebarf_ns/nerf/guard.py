@@ -67,10 +67,9 @@ class GuardedOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Raises :class:`TrainingError` when too many steps had to be skipped."""
         parameters = [parameter for group in param_groups for parameter in self.parameters[group]]
-        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         # A gradient scaler looks for overflow itself, and lowers its scale when it finds it. Accumulating gradients, no
         # group may be due.
-        if grad_scaler.is_enabled() or not gradients or self._trusted(parameters):
+        if grad_scaler.is_enabled() or not parameters or self._trusted(parameters):
             # A step in which the keyframes do not learn says nothing of their gradients.
             if all(one.grad is not None for one in self.parameters.get("camera_opt", ())):
                 self.skipped_in_a_row = 0

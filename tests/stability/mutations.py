@@ -108,7 +108,7 @@ MUTATIONS = (
              "test_training.py::test_case_26_a_run_resumed_in_another_process_ends_bitwise_where_an_uninterrupted_one_does"),
     Mutation(27, GUARD, "bool(norms.isfinite().all())", "True",
              "test_training.py::test_case_27_a_step_with_a_broken_gradient_changes_nothing"),
-    Mutation(28, GUARD, " if parameter.grad is not None]", "]",
+    Mutation(28, GUARD, "zero if one.grad is None else ", "",
              "test_training.py::test_case_28_poses_without_gradients_under_mixed_precision_do_not_end_the_run"),
     Mutation(29, MODEL, "            config.near,\n", "            0.05,\n",
              "test_training.py::test_case_29_every_field_of_the_configuration_changes_the_run[near]"),
