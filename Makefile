@@ -19,9 +19,9 @@ check: setup
 	ruff format --check .
 	pyright --pythonpath $(abspath $(BIN)/python)
 
-# Two at a time; tests of one file stay together, as they share scenes and runs.
+# Two at a time; tests of one file stay together, as they share scenes and runs. A test that hangs fails.
 test: check
-	pytest -m "not slow and not gpu" -n 2 --dist loadscope --durations=10
+	pytest -m "not slow and not gpu" -n 2 --dist loadscope --durations=10 --timeout=600
 
 test-slow: check
 	pytest -m "slow"
