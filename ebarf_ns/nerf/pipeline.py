@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError, one_line_errors
@@ -25,6 +26,7 @@ from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras, replace_intrinsics
 from ebarf_ns.nerf.metrics_file import changed_parts, read_header
 from ebarf_ns.nerf.model import EbarfModel
+from ebarf_ns.nerf.upgrades import completed
 from ebarf_ns.scene import Frame, Scene
 
 # nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
@@ -55,6 +57,8 @@ class EbarfPipeline(VanillaPipeline):
                 self._check_references()
             else:
                 self._say_what_changed()
+        self.upgraded: list[str] = []
+        """Names that the checkpoint lacked which was loaded, if any: it is of an earlier version."""
         self.last_loss: Tensor | None = None
         """Of the last training step's event pairs."""
         self.register_buffer("cost", torch.zeros(2, dtype=torch.float64))
@@ -156,9 +160,10 @@ class EbarfPipeline(VanillaPipeline):
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Take the parameters of a checkpoint that is whole; what nerfstudio's scripts load comes this way too."""
         with one_line_errors():
-            state = unsealed(loaded_state, f"step-{step:09d}.ckpt")
-            # Earlier versions kept it; now it follows from the field.
-            state.pop("_model.display_range", None)
+            what = f"step-{step:09d}.ckpt"
+            state, self.upgraded = completed(unsealed(loaded_state, what), self.state_dict(), what)
+            if self.upgraded:
+                CONSOLE.print(f"{what} is of an earlier version: {', '.join(self.upgraded)} start as in a new training")
             super().load_pipeline(state, step)
             self.datamanager.shift_clock(int(self.model.camera_optimizer.clock_offset_us))
         if self.test_mode != "val":

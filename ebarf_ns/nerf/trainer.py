@@ -19,13 +19,13 @@ from ebarf_ns.evaluation.trajectory_error import trajectory_results
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.machine import use_threads
 from ebarf_ns.memory import peak_memory_mib
+from ebarf_ns.nerf import optimizers
 from ebarf_ns.nerf.alignment import Alignment, align
 from ebarf_ns.nerf.averaging import Averaging
 from ebarf_ns.nerf.checkpoints import chosen_checkpoint, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.guard import GuardedOptimizers
 from ebarf_ns.nerf.metrics_file import begin_metrics, flags_of, read_header
 from ebarf_ns.nerf.moments import write_moments
-from ebarf_ns.nerf.optimizers import BudgetDecay
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.replay import write_replay
 from ebarf_ns.nerf.run_evaluation import record_evaluation, write_refined
@@ -37,6 +37,10 @@ from ebarf_ns.nerf.support import Support, support
 from ebarf_ns.nerf.terminal import LiveLine, evaluation_line, plan_line, scene_line, summary
 from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
 from ebarf_ns.nerf.warm_up import compile_kernels
+
+# Where config.yml of earlier versions looks for them.
+FusedAdamConfig, KeyframeAdamConfig = optimizers.FusedAdamConfig, optimizers.KeyframeAdamConfig
+BudgetDecayConfig, BudgetDecayScheduler = optimizers.BudgetDecayConfig, optimizers.BudgetDecayScheduler
 
 _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
 
@@ -54,11 +58,8 @@ class EbarfTrainer(Trainer):
         self.live = LiveLine()
         self.results: dict[str, Any] = {}
         self.train_seconds = 0.0
-        self.event_pairs = 0
-        self.steps_done = 0
-        self.evaluated_step = self.saved_step = 0
+        self.steps_done = self.evaluated_step = self.saved_step = self.event_pairs = self.signal = 0
         self.last_loss = math.nan
-        self.signal = 0
         self.alignment: Alignment | None = None
         self.config.pipeline.datamanager.seed = self.config.machine.seed  # pyright: ignore[reportAttributeAccessIssue]
         self.config.pipeline.model.learn_intrinsics = self.config.learn_intrinsics  # pyright: ignore[reportAttributeAccessIssue]
@@ -200,7 +201,7 @@ class EbarfTrainer(Trainer):
         started = monotonic()
         before = self.progress()
         for scheduler in self.optimizers.schedulers.values():
-            if isinstance(scheduler, BudgetDecay):
+            if isinstance(scheduler, optimizers.BudgetDecay):
                 scheduler.progress = before
         try:
             result = super().train_iteration(step)
@@ -324,8 +325,10 @@ class EbarfTrainer(Trainer):
         changed = changed_flags(self._header_of_resumed_run.get("flags", {}), flags_of(self.config))
         try:
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
-            self.averaging.begin_from(ours.get("trained"))
-            self.optimizers.load_optimizers(state["optimizers"])
+            # The moments of an earlier version may be those of other parameters.
+            fits = not self.pipeline.upgraded
+            self.averaging.begin_from(ours.get("trained") if fits else None)
+            self.optimizers.load_optimizers(state["optimizers"] if fits else {})
             if self.config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
             self.grad_scaler.load_state_dict(state["scalers"])
