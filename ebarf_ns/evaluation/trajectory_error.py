@@ -109,7 +109,7 @@ def _align_by_orientation(estimated: PosePath3D, true: PosePath3D) -> tuple[np.n
 
 
 def _rotations(path: PosePath3D) -> Rotation:
-    return Rotation.from_matrix([pose[:3, :3] for pose in path.poses_se3])
+    return Rotation.from_matrix(np.asarray(path.poses_se3)[:, :3, :3])
 
 
 def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:

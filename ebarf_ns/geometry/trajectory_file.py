@@ -1,7 +1,7 @@
 """Trajectories on disk: TUM text, ``timestamp[s] tx ty tz qx qy qz qw``, one pose per line; ``#`` starts a comment."""
 
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import torch
@@ -11,7 +11,7 @@ from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, check_keyframes
 
 _COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-_DIGITS = 30
+_LARGEST = 1e30
 # Quaternions are written with 6 digits or more; a larger deviation from unit length is not rounding.
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -49,19 +49,20 @@ def read_tum(path: Path) -> Trajectory:
 def _parse_pose(place: str, fields: list[str]) -> tuple[int, list[float]]:
     if len(fields) != len(_COLUMNS):
         raise TrajectoryError(f"{place}: {len(fields)} columns, expected the 8 of TUM format: {' '.join(_COLUMNS)}")
-    values: list[Decimal] = []
+    row: list[float] = []
     for name, text in zip(_COLUMNS, fields, strict=True):
         try:
-            value = Decimal(text)
-        except InvalidOperation:
+            value = float(text)
+        except ValueError:
             raise TrajectoryError(f"{place}: {name} is {text!r}, expected a number") from None
-        if not value.is_finite() or value.adjusted() >= _DIGITS:
+        if not abs(value) < _LARGEST:
             raise TrajectoryError(f"{place}: {name} is {text}, expected a finite number")
-        values.append(value)
-    t_us = int((values[0] * 1_000_000).to_integral_value())
+        row.append(value)
+    # A float has no room for microseconds since 1970.
+    t_us = int((Decimal(fields[0]) * 1_000_000).to_integral_value())
     if abs(t_us) >= 1 << 62:
         raise TrajectoryError(f"{place}: timestamp {fields[0]} does not fit 64-bit microseconds, expected seconds")
-    row = [float(value) for value in values[1:]]
+    row = row[1:]
     length = sum(q * q for q in row[3:]) ** 0.5
     if abs(length - 1) > _QUATERNION_TOLERANCE:
         raise TrajectoryError(
