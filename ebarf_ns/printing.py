@@ -1,4 +1,4 @@
-"""How facts and suspicions are laid out on a terminal."""
+"""Terminal output of facts and warnings about a file or folder."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from rich.table import Table
 
 
 def print_facts(what: Path, suspicions: Sequence[str], facts: Sequence[tuple[str, str]]) -> Console:
-    """What looks wrong with a file or folder, then facts about it, each with its name; returns where it was printed."""
+    """Print warnings about a file or folder, then a table of named facts; returns the console."""
     console = Console(highlight=False)
     console.print(f"[bold]{escape(str(what))}[/bold]", soft_wrap=True)
     for suspicion in suspicions:
@@ -24,5 +24,5 @@ def print_facts(what: Path, suspicions: Sequence[str], facts: Sequence[tuple[str
 
 
 def print_line(console: Console, line: str, mark: str = "") -> None:
-    """One line, broken between words where a person reads it, whole where a program does."""
+    """Print one line, wrapped between words on a terminal and left unwrapped elsewhere."""
     console.print(mark + escape(line), soft_wrap=not console.is_terminal)

@@ -34,7 +34,7 @@ def test_a_busy_core_is_left_to_others(monkeypatch: pytest.MonkeyPatch, shares: 
 def test_what_the_environment_says_stands(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval, percpu: [100.0, 100.0])
-    assert free_threads() == Line("threads", 2, "OMP_NUM_THREADS says so")
+    assert free_threads() == Line("threads", 2, "set by OMP_NUM_THREADS")
 
 
 def test_torch_and_numba_follow(monkeypatch: pytest.MonkeyPatch):

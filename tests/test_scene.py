@@ -66,8 +66,8 @@ def camera(**changes: object) -> dict:
         (changed(version=0), "version is 0, expected an integer above 0"),
         (changed(events="a\x00b"), r"events is 'a\x00b', expected a file name"),
         (changed(events="\ud800.h5"), r"events is '\ud800.h5', expected a file name"),
-        (changed(events="../events.h5"), "events is '../events.h5', expected a file in the folder of this one"),
-        (changed(trajectory="/etc/passwd"), "trajectory is '/etc/passwd', expected a file in the folder of this one"),
+        (changed(events="../events.h5"), "events is '../events.h5', expected a file in the same folder"),
+        (changed(trajectory="/etc/passwd"), "trajectory is '/etc/passwd', expected a file in the same folder"),
         (camera(width=70_000, height=70_000), "camera.width is 70000, expected at most 67,108,864 pixels"),
         (camera(width=10**4000), "expected at most 67,108,864 pixels"),
         (camera(fx=1e300), "camera.fx is 1e+300, expected 0.0001 to"),
@@ -108,7 +108,7 @@ def test_wrong_scene_names_file_key_value_and_expectation(tmp_path: Path, scene:
     [
         ({**FRAME, "t_us": 1.5}, "[0].t_us is 1.5, expected an integer"),
         ({**FRAME, "t_us": 10**30}, "expected microseconds within ±"),
-        ({**FRAME, "file": "../frame.png"}, "[0].file is '../frame.png', expected a file in the folder of this one"),
+        ({**FRAME, "file": "../frame.png"}, "[0].file is '../frame.png', expected a file in the same folder"),
         ({**FRAME, "intensity": "gamma"}, "[0].intensity is 'gamma', expected one of linear, srgb, log"),
         ({**FRAME, "event_camera_from_frame_camera": [[1, 0], [0, 1]]}, "expected a 4x4 matrix"),
         ({**FRAME, "exposure": 1}, "unknown key [0].exposure"),
@@ -133,7 +133,7 @@ def test_broken_json_is_named(tmp_path: Path, content: bytes):
 def test_a_pipe_is_never_waited_for(tmp_path: Path, name: str):
     (make(tmp_path) / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / name)
-    with pytest.raises(SceneError, match=r"scene.json: (a pipe or a device|.* which is no file)"):
+    with pytest.raises(SceneError, match=r"scene.json: (a pipe or a device|.* which is not a file)"):
         read_scene(tmp_path)
 
 

@@ -22,19 +22,19 @@ _stderr = Console(stderr=True)
 
 @dataclass
 class Render:
-    """Pictures or a video of a finished run's scene along its refined trajectory, or the events that it predicts."""
+    """Render a finished run along its refined trajectory, as pictures, a video, or predicted events."""
 
     run_folder: tyro.conf.Positional[Path]
     """The folder with config.yml."""
     settings: tyro.conf.OmitArgPrefixes[RenderSettings] = field(default_factory=RenderSettings)
-    """Which pictures."""
+    """Which pictures to render."""
     output: Path | None = None
-    """The video, or the folder of pictures, to make; where not given, in exports/ of the run."""
+    """The video or the folder of pictures to write. Default: in exports/ of the run."""
     events: Path | None = None
-    """Instead of pictures: an HDF5 file to make, with what the sensor should have reported, /events/x y t p."""
+    """Write predicted events to this HDF5 file (/events/x, y, t, p) instead of pictures."""
 
     def run(self) -> None:
-        """Render, and say where it is."""
+        """Render, and print where the output is."""
         from ebarf_ns.export.pictures import render
 
         if self.events:
@@ -53,18 +53,18 @@ class Render:
 
         with _opened(self.run_folder, "simulating") as (finished, progress):
             if path.exists() and finished.scene.events.exists() and path.samefile(finished.scene.events):
-                raise ExportError(f"{path}: is the recording itself, expected another file")
+                raise ExportError(f"{path}: is the recording itself, expected a different file")
             predicted = write_events(finished, self.settings, path, progress)
         _stderr.print(f"{len(predicted):,} predicted events: {path}", soft_wrap=True)
         try:
             real = recorded(finished, self.settings)
         except RecordingError as error:
-            _stderr.print(f"not compared with the recording ({error})", soft_wrap=True)
+            _stderr.print(f"no comparison with the recording ({error})", soft_wrap=True)
             return
         camera = finished.scene.camera
         found = agreement(predicted, real, camera.width, camera.height)
         _stderr.print(
-            f"{len(real):,} were recorded in that time; counts per pixel correlate by "
+            f"{len(real):,} events were recorded in that time; counts per pixel correlate by "
             f"{found['brighter_correlation']:.3f} (brighter) and {found['darker_correlation']:.3f} (darker)",
             soft_wrap=True,
         )
@@ -72,64 +72,64 @@ class Render:
 
 @dataclass
 class Mesh:
-    """A mesh of the surfaces that a finished run has found, grey, in the trajectory's frame and scale: PLY."""
+    """Export the surfaces of a finished run as a grey PLY mesh, in the trajectory's frame and scale."""
 
     run_folder: tyro.conf.Positional[Path]
     """The folder with config.yml."""
     settings: tyro.conf.OmitArgPrefixes[SurfaceSettings] = field(default_factory=SurfaceSettings)
     """Which surface."""
     output: Path | None = None
-    """The .ply file to make; where not given, exports/mesh.ply of the run."""
+    """The .ply file to write. Default: exports/mesh.ply of the run."""
 
     def run(self) -> None:
-        """Write the mesh, and say where it is."""
+        """Write the mesh, and print where it is."""
         from ebarf_ns.export.surface import write_mesh
 
         output = _ply(self.output or self.run_folder / "exports" / "mesh.ply")
-        with _opened(self.run_folder, "looking around") as (finished, progress):
+        with _opened(self.run_folder, "rendering views") as (finished, progress):
             vertices, faces = write_mesh(finished, self.settings, output, progress)
         _stderr.print(f"{vertices:,} vertices, {faces:,} faces: {output}", soft_wrap=True)
 
 
 @dataclass
 class Points:
-    """A cloud of points of the surfaces that a finished run has found, grey, in the trajectory's frame: PLY."""
+    """Export the surfaces of a finished run as a grey PLY point cloud, in the trajectory's frame and scale."""
 
     run_folder: tyro.conf.Positional[Path]
     """The folder with config.yml."""
     settings: tyro.conf.OmitArgPrefixes[SurfaceSettings] = field(default_factory=SurfaceSettings)
     """Which surface."""
     output: Path | None = None
-    """The .ply file to make; where not given, exports/points.ply of the run."""
+    """The .ply file to write. Default: exports/points.ply of the run."""
 
     def run(self) -> None:
-        """Write the cloud, and say where it is."""
+        """Write the point cloud, and print where it is."""
         from ebarf_ns.export.surface import write_points
 
         output = _ply(self.output or self.run_folder / "exports" / "points.ply")
-        with _opened(self.run_folder, "looking around") as (finished, progress):
+        with _opened(self.run_folder, "rendering views") as (finished, progress):
             count = write_points(finished, self.settings, output, progress)
         _stderr.print(f"{count:,} points: {output}", soft_wrap=True)
 
 
 @dataclass
 class TrajectoryExport:
-    """A finished run's refined trajectory for other programs: evo, COLMAP's readers, nerfstudio and what reads these.
+    """Export a finished run's refined trajectory for other programs such as evo, COLMAP and nerfstudio.
 
-    In the frame and scale of the trajectory given, on the clock of the events.
+    It is in the frame and scale of the given trajectory, on the clock of the events.
     """
 
     run_folder: tyro.conf.Positional[Path]
     """The folder with config.yml."""
     format: TrajectoryFileFormat
-    """tum, kitti: a text file. colmap, transforms: a folder with rendered pictures and a cloud of points."""
+    """tum, kitti: a text file. colmap, transforms: a folder with rendered pictures and a point cloud."""
     output: Path | None = None
-    """The file or folder to make; where not given, in exports/ of the run."""
+    """The file or folder to write. Default: in exports/ of the run."""
     rate_hz: float | None = None
-    """Poses per second; where not given, those of the keyframes (of colmap and transforms, at most 300)."""
+    """Poses per second. Default: the poses of the keyframes (at most 300 for colmap and transforms)."""
 
     def run(self) -> None:
-        """Write the trajectory, and say where it is."""
+        """Write the trajectory, and print where it is."""
         from ebarf_ns.export.trajectory import export_trajectory
 
         folder = self.format in ("colmap", "transforms")
@@ -140,7 +140,7 @@ class TrajectoryExport:
         with _opened(self.run_folder, "rendering") as (finished, progress):
             poses, points = export_trajectory(finished, self.format, output, self.rate_hz, progress)
         if folder and not points:
-            _stderr.print("warning: no surface is seen sharply enough, the cloud of points is empty", soft_wrap=True)
+            _stderr.print("warning: no surface is sharp enough, the point cloud is empty", soft_wrap=True)
         _stderr.print(f"{poses:,} poses: {output}", soft_wrap=True)
 
 
@@ -151,11 +151,11 @@ def _ply(path: Path) -> Path:
 
 
 @contextmanager
-def _opened(run_folder: Path, what: str) -> "Iterator[tuple[FinishedRun, Callable[[float], None]]]":
-    """The run, and whom to tell how far one is."""
+def _opened(run_folder: Path, activity: str) -> "Iterator[tuple[FinishedRun, Callable[[float], None]]]":
+    """Yield the finished run, and a function that reports progress from 0 to 1."""
     from ebarf_ns.nerf.finished_run import open_run
 
     with Progress(transient=True, console=_stderr, disable=not _stderr.is_terminal) as shown:
         task = shown.add_task("opening the run", total=None)
         finished = open_run(run_folder)
-        yield finished, lambda share: shown.update(task, description=what, completed=share, total=1.0)
+        yield finished, lambda share: shown.update(task, description=activity, completed=share, total=1.0)

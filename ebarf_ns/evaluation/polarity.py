@@ -1,4 +1,4 @@
-"""Whether events and frames agree on what becomes brighter."""
+"""Agreement of event polarities with brightness changes between frames."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.scene import Scene
 
 _MOST_PAIRS, _LONGEST_US, _FEWEST_PIXELS = 12, 200_000, 100
-_CONTRADICTION, _OF_PAIRS = -0.2, 0.8
+_CONTRADICTS_BELOW, _MOST_OF_PAIRS = -0.2, 0.8
 _DARKEST = 0.01
 
 
 def polarity_correlations(scene: Scene) -> list[float]:
-    """Correlations of the change between frames with the events between them, over pixels that have events.
+    """Return the correlations of the change between two frames with the events between them, over active pixels.
 
-    Of up to 12 pairs of consecutive frames that the event camera took itself, at most 0.2 s apart. A pair with fewer
-    than 100 such pixels, or without change, tells nothing and is left out.
+    Uses up to 12 pairs of consecutive frames of the event camera itself, at most 0.2 s apart. Pairs with fewer than 100
+    active pixels, or without any change, are left out.
     """
     camera = scene.camera
-    own = [
+    frames = [
         one
         for one in scene.frames
         if one.camera == camera and np.allclose(one.event_camera_from_frame_camera, np.eye(4))
     ]
-    pairs = [two for two in pairwise(own) if 0 < two[1].t_us - two[0].t_us <= _LONGEST_US]
+    pairs = [two for two in pairwise(frames) if 0 < two[1].t_us - two[0].t_us <= _LONGEST_US]
     pairs = pairs[:: max(len(pairs) // _MOST_PAIRS, 1)][:_MOST_PAIRS]
     recording = RecordingFile(scene.events, camera.width, camera.height)
     found = []
@@ -47,11 +47,12 @@ def _log_brightness(frame: np.ndarray) -> np.ndarray:
 
 
 def polarity_contradicted(correlations: list[float]) -> str | None:
-    """A sentence where frames become darker where events say brighter, in most of at least three pairs of frames."""
-    against = [one for one in correlations if one < _CONTRADICTION]
-    if len(correlations) < 3 or len(against) < _OF_PAIRS * len(correlations):
+    """Return a warning if frames contradict the polarity in most of at least three pairs, None otherwise."""
+    against = [one for one in correlations if one < _CONTRADICTS_BELOW]
+    if len(correlations) < 3 or len(against) < _MOST_OF_PAIRS * len(correlations):
         return None
     return (
-        f"frames become darker where events say brighter (correlation {np.median(correlations):.2f}, in {len(against)} "
-        f"of {len(correlations)} pairs of frames): inverted polarity? ebarf process --flip-polarity turns it"
+        f"frames become darker where events report brighter (correlation {np.median(correlations):.2f}, in "
+        f"{len(against)} of {len(correlations)} pairs of frames): polarity may be inverted; ebarf process "
+        "--flip-polarity corrects it"
     )

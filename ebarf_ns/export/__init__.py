@@ -1,1 +1,1 @@
-"""A finished run as what other programs read: pictures, video, events, mesh, points, poses."""
+"""Exports of a finished run for other programs: pictures, video, events, mesh, points and poses."""

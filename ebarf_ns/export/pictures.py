@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 _MOST_PICTURES = 1_000_000
 FRAME_NAME = "frame_{:010d}"
-"""As event-to-video tools name them."""
+"""The file naming of event-to-video tools."""
 
 
 def render(
     subject: Subject, settings: RenderSettings, output: Path, progress: Callable[[float], None] = lambda fraction: None
 ) -> int:
-    """Write a folder of PNG or EXR pictures with timestamps.txt, or an mp4 with NAME_timestamps.txt; returns how many.
+    """Write PNG or EXR pictures with timestamps.txt, or an mp4 with NAME_timestamps.txt; returns the picture count.
 
-    Raises :class:`ExportError` before anything is rendered.
+    Raises :class:`ExportError` for invalid settings, before anything is rendered.
     """
     t_us = picture_times(subject, settings)
     if settings.height is not None and not 1 <= settings.height <= 1 << 14:
@@ -52,20 +52,20 @@ def render(
 
 
 def span_us(subject: Subject, span: Span) -> tuple[int, int]:
-    """First and last moment; raises :class:`ExportError` for those that the refined trajectory does not reach."""
+    """Return start and end; raises :class:`ExportError` unless they lie in the span of the refined trajectory."""
     first_us, last_us = subject.trajectory.t_us[[0, -1]].tolist()
     start_us = first_us if span.start_us is None else span.start_us
     end_us = last_us if span.end_us is None else span.end_us
     if not first_us <= start_us < end_us <= last_us:
         raise ExportError(
-            f"from {start_us} to {end_us} us was asked for, expected times that increase, from {first_us} to {last_us} "
-            "us, the span of the refined trajectory"
+            f"the requested span is {start_us} to {end_us} us, expected increasing times within {first_us} to "
+            f"{last_us} us, the span of the refined trajectory"
         )
     return start_us, end_us
 
 
 def picture_times(subject: Subject, settings: RenderSettings) -> Int64[np.ndarray, "pictures"]:
-    """When pictures are taken; raises :class:`ExportError` for impossible rates."""
+    """Return the times of the pictures; raises :class:`ExportError` for invalid rates."""
     start_us, end_us = span_us(subject, settings)
     for name in ("fps", "slow"):
         if not 0 < getattr(settings, name) < 1e9:
@@ -74,14 +74,14 @@ def picture_times(subject: Subject, settings: RenderSettings) -> Int64[np.ndarra
     count = int((end_us - start_us) / every_us + 1e-9) + 1
     if every_us < 1 or count > _MOST_PICTURES:
         raise ExportError(
-            f"{settings.fps:g} fps {settings.slow:g} times slower are {count:,} pictures, {every_us:g} us apart; "
-            f"expected 1 us or more between them, and at most {_MOST_PICTURES:,}"
+            f"{settings.fps:g} fps slowed down {settings.slow:g} times give {count:,} pictures {every_us:g} us apart, "
+            f"expected at most {_MOST_PICTURES:,}, at least 1 us apart"
         )
     return start_us + (every_us * np.arange(count)).round().astype(np.int64)
 
 
 def write_times(path: Path, t_us: Int64[np.ndarray, "pictures"]) -> None:
-    """Seconds, one picture a line."""
+    """Write the times in seconds, one picture per line."""
     path.write_text("".join(f"{format_seconds(one)}\n" for one in t_us.tolist()), encoding="utf-8")
 
 
@@ -92,7 +92,7 @@ def write_pictures(
     folder: Path,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> None:
-    """8-bit PNG, grey linear in log brightness, by one black and one white for all."""
+    """Write 8-bit PNGs, grey linear in log brightness, with the same black and white levels for all."""
     tone = _tone(subject, t_us)
     for k, one in enumerate(t_us.tolist()):
         write_picture(folder / f"{FRAME_NAME.format(k)}.png", tone.grey(look(subject, camera, one).brightness))
@@ -100,7 +100,7 @@ def write_pictures(
 
 
 def _write_exr(subject: Subject, camera: Camera, t_us: np.ndarray, folder: Path, progress: Callable) -> None:
-    # OpenCV asks for this at its first picture.
+    # OpenCV reads this variable when it first handles an image.
     os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
     import cv2
 
@@ -111,7 +111,7 @@ def _write_exr(subject: Subject, camera: Camera, t_us: np.ndarray, folder: Path,
             try:
                 write_picture(folder / f"{stem}.exr", image)
             except cv2.error:
-                raise ExportError(f"{stem}.exr cannot be written: expected an OpenCV that knows EXR") from None
+                raise ExportError(f"{stem}.exr cannot be written, expected an OpenCV build with EXR support") from None
         progress((k + 1) / len(t_us))
 
 
@@ -121,9 +121,11 @@ def _write_video(
     import mediapy
 
     if output.suffix.lower() != ".mp4":
-        raise ExportError(f"{output}: is to be a video, expected the name of an .mp4 file, or --format png or exr")
+        raise ExportError(
+            f"{output}: a video needs another name, expected the name of an .mp4 file, or --format png or exr"
+        )
     if shutil.which("ffmpeg") is None:
-        raise ExportError("ffmpeg is not on the path, expected it for videos; --format png does without")
+        raise ExportError("ffmpeg is not on the path, expected it for videos; --format png works without it")
     tone = _tone(subject, t_us)
     with whole_file(output) as temporary:
         shape = (camera.height, camera.width)

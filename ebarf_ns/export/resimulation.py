@@ -1,4 +1,4 @@
-"""The recording as it should have been: what the sensor reports of the trained scene along the refined trajectory."""
+"""Predicted events: a simulation of the sensor in the trained scene, along the refined trajectory."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _NEAREST_PERCENT = 5
 
 
 @dataclass(frozen=True)
-class _Field:
-    """The trained scene as surroundings to cast rays into."""
+class _TrainedScene:
+    """The trained scene, as a scene that the simulation casts rays into."""
 
     subject: Subject
 
     def cast(
         self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]
     ) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
-        """Radiance, and the distance that decides how often to render, in the trajectory's unit."""
+        """Return radiance, and distances that determine the rendering rate, in the trajectory's unit."""
         seen = self.subject.see(origin, direction)
-        # A few rays that end in residual density near the camera would ask for a render every microsecond.
+        # A few rays that end in residual density near the camera would require a render every microsecond.
         distance = (
             np.maximum(seen.distance, np.percentile(seen.distance, _NEAREST_PERCENT)) if len(origin) else seen.distance
         )
@@ -45,18 +45,18 @@ class _Field:
 
 
 @dataclass(frozen=True)
-class _Refined:
-    """The refined trajectory as a motion that begins at time 0."""
+class _RefinedMotion:
+    """The refined trajectory as a motion that starts at time 0."""
 
     subject: Subject
     start_us: int
 
     def position(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
-        """Camera centres, in the trajectory's unit."""
+        """Return camera centres, in the trajectory's unit."""
         return self._matrices(t_us)[:, :, 3]
 
     def rotation(self, t_us: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
-        """Camera-to-world rotations, OpenCV axes."""
+        """Return camera-to-world rotations, OpenCV axes."""
         return self._matrices(t_us)[:, :, :3]
 
     def _matrices(self, t_us: np.ndarray) -> np.ndarray:
@@ -67,12 +67,12 @@ class _Refined:
 def write_events(
     subject: Subject, span: Span, path: Path, progress: Callable[[float], None] = lambda fraction: None
 ) -> Recording:
-    """Write the events of a stretch of time in the layout of events.h5, and return them.
+    """Simulate the events of a time span, write them in the layout of events.h5, and return them.
 
-    Raises :class:`ExportError` for impossible spans.
+    Raises :class:`ExportError` for invalid spans.
     """
     start_us, end_us = span_us(subject, span)
-    view = View(_Field(subject), _Refined(subject, start_us), subject.camera, rays_per_pixel=1)
+    view = View(_TrainedScene(subject), _RefinedMotion(subject, start_us), subject.camera, rays_per_pixel=1)
     events = record(view, subject.sensor, end_us - start_us, _SEED, progress)
     events = replace(events, t_us=events.t_us + start_us)
     write_recording(path, [events], source=path)
@@ -80,13 +80,13 @@ def write_events(
 
 
 def recorded(subject: Subject, span: Span) -> Recording:
-    """What was recorded in that time; raises :class:`RecordingError` where it cannot be read."""
+    """Return the recorded events of a time span; raises :class:`RecordingError` if they cannot be read."""
     camera = subject.scene.camera
     return RecordingFile(subject.scene.events, camera.width, camera.height).window(*span_us(subject, span))
 
 
 def agreement(predicted: Recording, real: Recording, width: int, height: int) -> dict[str, float]:
-    """Numbers of events, and how well their counts per pixel go together, brighter and darker apart: correlations."""
+    """Return the numbers of events, and the correlations of their counts per pixel, for each polarity."""
     numbers: dict[str, float] = {"predicted": len(predicted), "recorded": len(real)}
     for name, polarity in (("brighter", 1), ("darker", -1)):
         counts = [

@@ -1,4 +1,4 @@
-"""What can be asked of an export."""
+"""Settings of exports."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,36 +9,36 @@ TrajectoryFileFormat = Literal["tum", "kitti", "colmap", "transforms"]
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of time, on the clock of the events."""
+    """A time span, on the clock of the events."""
 
     start_us: int | None = None
-    """First moment; where not given, that of the refined trajectory."""
+    """Start, in microseconds. Default: the start of the refined trajectory."""
     end_us: int | None = None
-    """Last moment; where not given, that of the refined trajectory."""
+    """End, in microseconds. Default: the end of the refined trajectory."""
 
 
 @dataclass(frozen=True)
 class RenderSettings(Span):
-    """Which pictures."""
+    """Which pictures to render."""
 
     format: PictureFormat = "mp4"
-    """mp4: a video. png: 8-bit pictures. exr: 32-bit linear intensity, up to one factor, and depth."""
+    """mp4: a video. png: 8-bit pictures. exr: 32-bit linear intensity, up to a common factor, and depth."""
     fps: float = 25.0
     """Pictures per second of the video."""
     slow: float = 1.0
-    """How many times slower than it was the video shows it: 25 fps 40 times slower are 1,000 pictures a second."""
+    """Slow-motion factor of the video: 25 fps at factor 40 render 1,000 pictures per second of the recording."""
     height: int | None = None
-    """Rows of a picture, columns in proportion; where not given, the sensor's."""
+    """Rows of a picture, with columns in proportion. Default: the sensor's."""
 
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """Which surface, and how fine; lengths in the trajectory's unit."""
+    """Which surface to extract, and its resolution; lengths are in the trajectory's unit."""
 
     voxel: float | None = None
-    """Size of a cell; where not given, a 160th of what is seen."""
+    """Voxel size. Default: 1/160 of the extent of the visible surfaces."""
     farthest: float | None = None
-    """Leave out what is further from the camera than this."""
+    """Leave out surfaces further from the camera than this."""
     blur: float = 0.08
     """Leave out rays where half of the compositing weight is spread over more than this share of the depth. Higher:
-    fewer holes, less exact surfaces."""
+    fewer holes, less accurate surfaces."""

@@ -1,4 +1,4 @@
-"""What is exported: a scene that was trained, in the input's world frame, scale and clock."""
+"""The trained scene to export, in the input's world frame, scale and clock."""
 
 from typing import NamedTuple, Protocol
 
@@ -13,16 +13,16 @@ from ebarf_ns.simulation.sensor import SensorModel
 
 
 class Seen(NamedTuple):
-    """What rays see, float32."""
+    """Results of rendered rays, float32."""
 
     brightness: Float[np.ndarray, "rays"]
-    """Log brightness, up to an offset and, where thresholds are not known, a gain."""
+    """Log brightness, up to an offset and, if the contrast thresholds are unknown, a gain."""
     distance: Float[np.ndarray, "rays"]
-    """Of the surface, along the ray, in the trajectory's unit."""
+    """Distance of the surface along the ray, in the trajectory's unit."""
     spread: Float[np.ndarray, "rays"]
-    """Distance between the quantiles that hold the half of the compositing weight around it, in the same unit."""
+    """Distance between the quantiles that contain half of the compositing weight around it, in the same unit."""
     accumulation: Float[np.ndarray, "rays"]
-    """Opacity: share of the light that comes from the scene, not the background."""
+    """Opacity: the share of light from the scene rather than the background."""
 
 
 class Subject(Protocol):
@@ -30,16 +30,16 @@ class Subject(Protocol):
 
     scene: Scene
     camera: Camera
-    """With the intrinsics that were learned, where any were."""
+    """The camera, with learned intrinsics if any were."""
     trajectory: Trajectory
     """The refined keyframes, on the clock of the events."""
     sensor: SensorModel
-    """What is known and what was learned of the sensor."""
+    """The sensor model, with known and learned parameters."""
 
     def poses_at(self, t_us: Int64[Tensor, "times"]) -> Poses:
-        """Refined poses, float64; times outside the trajectory's span count as its nearer end."""
+        """Return refined poses, float64; times outside the trajectory's span are clamped to it."""
         ...
 
     def see(self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]) -> Seen:
-        """What rays with unit directions see."""
+        """Render rays with unit directions."""
         ...

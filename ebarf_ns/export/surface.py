@@ -1,4 +1,4 @@
-"""The surfaces that a run has found: a mesh, and a cloud of points, of all that its keyframes see."""
+"""Surfaces of a run, from the views of its keyframes: a mesh and a point cloud."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_mesh(
 ) -> tuple[int, int]:
     """Write a PLY mesh with grey vertex colours; returns the numbers of vertices and faces.
 
-    Raises :class:`ExportError` where there is no surface.
+    Raises :class:`ExportError` if no surface is sharp enough.
     """
     import trimesh
 
@@ -52,7 +52,7 @@ def write_mesh(
         volume.add(view)
     mesh = volume.surface()
     if not len(mesh.face):
-        raise NoSurfaceError("no surface is seen sharply enough for a mesh, expected a longer training")
+        raise NoSurfaceError("no surface is sharp enough for a mesh, try a longer training")
     grey = _tone(subject).grey(mesh.brightness)
     with whole_file(path) as temporary:
         trimesh.Trimesh(mesh.vertex, mesh.face, vertex_colors=_rgba(grey), process=False).export(temporary)
@@ -62,14 +62,14 @@ def write_mesh(
 def write_points(
     subject: Subject, settings: SurfaceSettings, path: Path, progress: Callable[[float], None] = lambda fraction: None
 ) -> int:
-    """Write a PLY cloud with grey colours; returns the number of points. Raises :class:`ExportError` for none."""
+    """Write a grey PLY point cloud; returns the number of points. Raises :class:`ExportError` if there are none."""
     found = points(subject, settings, progress)
     write_cloud(found, path)
     return len(found.position)
 
 
 def write_cloud(found: Points, path: Path) -> None:
-    """Write points as PLY."""
+    """Write a point cloud as PLY."""
     import trimesh
 
     with whole_file(path) as temporary:
@@ -79,10 +79,10 @@ def write_cloud(found: Points, path: Path) -> None:
 def points(
     subject: Subject, settings: SurfaceSettings, progress: Callable[[float], None] = lambda fraction: None
 ) -> Points:
-    """What the pixels of whole views see, one mean point for each cell; raises :class:`ExportError` for none."""
+    """Return the surface points of full views, averaged per voxel; raises :class:`ExportError` if there are none."""
     views = _views(subject, settings, progress)
     lower, upper, voxel = _box(subject, views, settings)
-    position, brightness = (np.concatenate(column) for column in zip(*map(_seen, views), strict=True))
+    position, brightness = (np.concatenate(column) for column in zip(*map(_surface_points, views), strict=True))
     inside = ((position >= lower) & (position <= upper)).all(axis=1)
     position, brightness = position[inside], brightness[inside]
     cell = np.floor((position - lower) / voxel).astype(np.int64)
@@ -93,56 +93,56 @@ def points(
 
 
 def _views(subject: Subject, settings: SurfaceSettings, progress: Callable[[float], None]) -> list[View]:
-    """What keyframes see, where it is sharp, by a camera without distortion."""
+    """Render undistorted views of keyframes, with distance 0 where the surface is not sharp."""
     for name, value in vars(settings).items():
         if value is not None and not value > 0:
             raise ExportError(f"{name} is {value}, expected a length above 0")
     camera = without_distortion(subject.camera)
-    within = _within(subject.camera, bearings(camera))
+    in_view = _in_view(subject.camera, bearings(camera))
     t_us = evenly(subject.trajectory.t_us.numpy(), _MOST_VIEWS).tolist()
     views = []
     for k, one in enumerate(t_us):
         view = look(subject, camera, one)
-        sharp = within & (view.spread < settings.blur * view.distance)
+        sharp = in_view & (view.spread < settings.blur * view.distance)
         if settings.farthest:
             sharp &= view.distance <= settings.farthest
         views.append(replace(view, distance=np.where(sharp, view.distance, 0)))
         progress((k + 1) / len(t_us))
     if not any(view.distance.any() for view in views):
-        raise NoSurfaceError("no surface is seen sharply enough, expected a longer training")
+        raise NoSurfaceError("no surface is sharp enough, try a longer training")
     return views
 
 
 def without_distortion(camera: Camera) -> Camera:
-    """A pinhole camera that sees what another does up to 60 degrees off its axis, in no more pixels than are needed."""
+    """Return a pinhole camera that covers another's view up to 60 degrees off its axis, in few pixels."""
     bearing = bearings(camera)
     ahead = bearing[bearing[..., 2] > 1 / np.hypot(1, _WIDEST_TAN)]
     (left, top), (right, bottom) = (edge((ahead[:, :2] / ahead[:, 2:]), axis=0) for edge in (np.min, np.max))
     pixels = ((right - left) * camera.fx + 1) * ((bottom - top) * camera.fy + 1)
-    finer = min(1.0, np.sqrt(_MOST_PIXELS / pixels))
-    fx, fy = camera.fx * finer, camera.fy * finer
+    shrink = min(1.0, np.sqrt(_MOST_PIXELS / pixels))
+    fx, fy = camera.fx * shrink, camera.fy * shrink
     width, height = (int(np.ceil(span)) + 1 for span in ((right - left) * fx, (bottom - top) * fy))
     return Camera("pinhole", width, height, fx, fy, float(-left * fx), float(-top * fy))
 
 
-def _within(camera: Camera, bearing: Float[np.ndarray, "height width 3"]) -> np.ndarray:
-    """Which directions a camera sees."""
+def _in_view(camera: Camera, bearing: Float[np.ndarray, "height width 3"]) -> np.ndarray:
+    """Return which directions are in the view of a camera."""
     x, y = camera.project(torch.from_numpy(bearing)).numpy().transpose(2, 0, 1)
     return (x >= -0.5) & (y >= -0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
 
 
-def _seen(view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and brightness of what is sharp in a view."""
-    solid = view.distance > 0
-    local = view.bearing[solid] * view.distance[solid][:, None]
-    return local @ view.pose[:, :3].T + view.pose[:, 3], view.brightness[solid]
+def _surface_points(view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and brightness of the sharp surface points of a view."""
+    sharp = view.distance > 0
+    local = view.bearing[sharp] * view.distance[sharp][:, None]
+    return local @ view.pose[:, :3].T + view.pose[:, 3], view.brightness[sharp]
 
 
 def _box(
     subject: Subject, views: list[View], settings: SurfaceSettings
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Corners around what is seen, and the size of a voxel."""
-    position = np.concatenate([_seen(view)[0] for view in views])
+    """Return the corners of a box around the visible surfaces, and the voxel size."""
+    position = np.concatenate([_surface_points(view)[0] for view in views])
     lower, upper = np.percentile(position, (_EDGE_PERCENT, 100 - _EDGE_PERCENT), axis=0)
     margin = _MARGIN * (upper - lower).max()
     lower, upper = lower - margin, upper + margin
@@ -151,7 +151,7 @@ def _box(
     voxel = settings.voxel or float((upper - lower).max()) / _VOXELS
     count = np.prod(np.ceil((upper - lower) / voxel))
     if not count <= _MOST_VOXELS:
-        raise ExportError(f"voxel is {voxel:g}, which makes {count:.3g} of them; expected at most {_MOST_VOXELS:,}")
+        raise ExportError(f"voxel is {voxel:g}, which gives {count:.3g} voxels, expected at most {_MOST_VOXELS:,}")
     return lower, upper, voxel
 
 

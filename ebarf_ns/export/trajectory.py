@@ -39,11 +39,11 @@ def export_trajectory(
     rate_hz: float | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[int, int]:
-    """Write poses of all keyframes, or at a rate between the first and the last; returns the numbers of poses, points.
+    """Write the poses of the keyframes, or poses at a constant rate; returns the numbers of poses and points.
 
-    tum is a file; kitti a file with NAME_times.txt beside it; colmap and transforms are folders with rendered pictures,
-    of at most 300 keyframes where no rate is given, and a cloud of points, which is empty where no surface is sharp.
-    Raises :class:`ExportError`.
+    tum is a file; kitti is a file with NAME_times.txt beside it; colmap and transforms are folders with rendered
+    pictures, of at most 300 keyframes if no rate is given, and a point cloud, which is empty if no surface is sharp.
+    Raises :class:`ExportError` for invalid rates.
     """
     pictures = format_ in ("colmap", "transforms")
     t_us = _times(subject, rate_hz, _MOST_PICTURES if pictures else _MOST_POSES)
@@ -63,7 +63,7 @@ def export_trajectory(
             write_pictures(subject, subject.camera, t_us, folder / "images", progress)
             write_times(folder / "timestamps.txt", t_us)
             with suppress(NoSurfaceError):
-                cloud = _some(points(subject, SurfaceSettings()))
+                cloud = _subsampled(points(subject, SurfaceSettings()))
                 write_cloud(cloud, folder / "points.ply")
             if format_ == "colmap":
                 _write_colmap(subject.camera, matrix, cloud, folder / "sparse" / "0")
@@ -77,21 +77,21 @@ def _times(subject: Subject, rate_hz: float | None, most: int) -> Int64[np.ndarr
     if rate_hz is None:
         return evenly(keyframe_t_us, most)
     if not 0 < rate_hz <= 1e6:
-        raise ExportError(f"rate is {rate_hz} Hz, expected above 0 and at most 1,000,000")
+        raise ExportError(f"rate is {rate_hz} Hz, expected a value above 0 and at most 1,000,000")
     first_us, last_us = keyframe_t_us[[0, -1]].tolist()
     count = int((last_us - first_us) * rate_hz * 1e-6 + 1e-9) + 1
     if count > _MOST_POSES:
-        raise ExportError(f"{rate_hz} Hz makes {count:,} poses, expected at most {_MOST_POSES:,}")
+        raise ExportError(f"{rate_hz} Hz gives {count:,} poses, expected at most {_MOST_POSES:,}")
     return first_us + (np.arange(count) * 1e6 / rate_hz).round().astype(np.int64)
 
 
-def _some(cloud: Points) -> Points:
+def _subsampled(cloud: Points) -> Points:
     chosen = np.random.default_rng(0).permutation(len(cloud.position))[:_MOST_POINTS]
     return Points(cloud.position[chosen], cloud.grey[chosen])
 
 
 def _write_colmap(camera: Camera, matrix: Float[np.ndarray, "poses 3 4"], cloud: Points, folder: Path) -> None:
-    """COLMAP's text files: world to camera, quaternions scalar first, pixel centres at halves."""
+    """Write COLMAP's text files: world to camera, quaternions scalar first, pixel centres at half-integers."""
     folder.mkdir(parents=True)
     name, parameters = _colmap_camera(camera)
     numbers = " ".join(f"{value:.9g}" for value in parameters)
@@ -100,8 +100,8 @@ def _write_colmap(camera: Camera, matrix: Float[np.ndarray, "poses 3 4"], cloud:
         encoding="utf-8",
     )
     to_camera = Rotation.from_matrix(matrix[:, :, :3]).inv()
-    shift = -to_camera.apply(matrix[:, :, 3])
-    rows = np.hstack([to_camera.as_quat()[:, [3, 0, 1, 2]], shift])
+    translation = -to_camera.apply(matrix[:, :, 3])
+    rows = np.hstack([to_camera.as_quat()[:, [3, 0, 1, 2]], translation])
     with (folder / "images.txt").open("w", encoding="utf-8") as file:
         file.write("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[]: none\n")
         for k, row in enumerate(rows.tolist()):
@@ -128,7 +128,7 @@ def _colmap_camera(camera: Camera) -> tuple[str, list[float]]:
 def _write_transforms(
     camera: Camera, matrix: Float[np.ndarray, "poses 3 4"], t_us: Int64[np.ndarray, "poses"], folder: Path
 ) -> None:
-    """nerfstudio's transforms.json: camera to world with y up and z backward, pixel centres at halves."""
+    """Write transforms.json: camera to world with y up and z backward, pixel centres at half-integers."""
     fisheye = camera.model == "equidistant"
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     whole = np.broadcast_to(np.eye(4), (len(matrix), 4, 4)).copy()

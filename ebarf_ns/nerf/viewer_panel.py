@@ -1,7 +1,7 @@
-"""What nerfstudio's viewer shows besides renders: trajectories, keyframes, the events of a moment, and progress.
+"""The panel in nerfstudio's viewer: trajectories, keyframes, events around a time, and training progress.
 
-nerfstudio finds the panel as an attribute of the pipeline and hands it its viewer, in ns-train and ns-viewer alike.
-Nothing is read, drawn or rendered before somebody looks.
+nerfstudio finds the panel as an attribute of the pipeline and passes it the viewer, in both ns-train and ns-viewer.
+Nothing is read, drawn or rendered before a client connects.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-# A chore that took a second comes again after so many.
-_REST, _LEAST_REST_S = 50.0, 1.0
+# A task that took a second is repeated after this many seconds.
+_PAUSE_FACTOR, _LEAST_PAUSE_S = 50.0, 1.0
 _MOST_RECORDS = 400
 _CPU_MAX_RES = 256
 
 
 @dataclass
-class _Chore:
-    """Something to be kept up to date while training goes on, at a small share of the time."""
+class _RecurringTask:
+    """Something that is updated repeatedly during training, in a small share of the time."""
 
     do: Callable[[], None]
     due_s: float = 0.0
@@ -50,68 +50,68 @@ class _Chore:
         started = time.monotonic()
         self.do()
         ended = time.monotonic()
-        self.due_s = ended + max(_LEAST_REST_S, _REST * (ended - started))
+        self.due_s = ended + max(_LEAST_PAUSE_S, _PAUSE_FACTOR * (ended - started))
 
 
 class ViewerPanel(ViewerControl):
-    """The panel "Event camera" of nerfstudio's viewer."""
+    """The "Event camera" panel in nerfstudio's viewer."""
 
     def __init__(self, pipeline: EbarfPipeline):
-        # nerfstudio looks through what is public.
+        # nerfstudio searches the public attributes for viewer elements.
         self._pipeline = pipeline
         self._viewer: Viewer | None = None
         self._records: list[dict[str, Any]] = []
         self._losses: list[tuple[int, Tensor]] = []
-        self._every = 1
+        self._record_interval = 1
         self._step = 0
         self._drawing = threading.Lock()
-        self._looked_at = False
-        self._wanted = self._shown = 0
+        self._scene_drawn = False
+        self._requested = self._shown = 0
 
     def _setup(self, viewer: Viewer) -> None:
-        """Called by nerfstudio when its viewer is built, but for the scene."""
+        """Set up the panel; nerfstudio calls this once its viewer is built, before the scene is."""
         super()._setup(viewer)
-        # Their buttons are there before the scene is.
+        # The buttons that use these handles exist before the scene does.
         viewer.camera_handles = {}
         config = viewer.config
         self._drawn = DrawnScene(
             self._pipeline, self.viser_server, config.max_num_display_images, config.camera_frustum_scale
         )
-        # nerfstudio's own frustums have the horizontal field of view for the vertical one, and stay where they began.
+        # nerfstudio's own frustums use the horizontal field of view as the vertical one, and are never moved.
         viewer.config = replace(config, max_num_display_images=0)
         for button in (viewer.hide_images, viewer.show_images, *([] if viewer.trainer else [viewer.pause_train])):
             button.visible = False
-        # Without its logo, which is fetched from the network.
+        # The default theme has a logo that is fetched from the network.
         self.viser_server.gui.configure_theme(control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105))
-        chores = (self._drawn.draw_lines, self._draw_curves, self._pipeline.fit_display_range, self._show_moment_again)
-        self._chores = [_Chore(do) for do in chores]
-        # Fog before the camera would hide the trajectories, and a coarse picture's depth cuts them to pieces.
+        tasks = (self._drawn.draw_lines, self._draw_curves, self._pipeline.fit_display_range, self._show_moment_again)
+        self._tasks = [_RecurringTask(do) for do in tasks]
+        # With depth, fog near the camera would hide the trajectories, and coarse renders would cut them to pieces.
         viewer.control_panel._layer_depth.value = False
         if viewer.trainer and self._pipeline.device.type == "cpu":
-            # A picture of 512 pixels takes seconds there, and training gets nine tenths of the time.
+            # A render of 512 pixels takes seconds on a CPU, and training gets nine tenths of the time.
             viewer.control_panel._max_res.value = _CPU_MAX_RES
         self._build()
         self._viewer = viewer
-        self.viser_server.on_client_connect(self._welcome)
+        self.viser_server.on_client_connect(self._on_connect)
 
     def _build(self) -> None:
         gui, scene = self.viser_server.gui, self.viser_server.scene
         model = self._pipeline.model
         times = model.camera_optimizer.keyframe_t_us
         self._given = model.camera_optimizer.given.cpu()
-        shown = {
+        labels = {
             "initial": "initial, blue",
             "refined": "refined, orange",
             "reference": "reference, green",
             "keyframes": "keyframes",
         }
         if self._pipeline.scene.groundtruth is None:
-            del shown["reference"]
+            del labels["reference"]
         with gui.add_folder("Event camera", order=-1):
             length_s = max(round(1e-6 * float(times[-1] - times[0]), 3), 0.001)
             self._time = gui.add_slider("time [s]", 0.0, length_s, 0.001, round(length_s / 2, 3))
             self._picture = gui.add_markdown("", image_root=Path())
-            self._follow = gui.add_checkbox("look from there", True)
+            self._follow = gui.add_checkbox("follow the camera", True)
             last = len(self._given) - 1
             self._keyframe = gui.add_number("keyframe", last // 2, min=0, max=last, step=1)
             gui.add_button("Fly to keyframe").on_click(self._fly_to_keyframe)
@@ -120,10 +120,10 @@ class ViewerPanel(ViewerControl):
             if model.camera_optimizer.config.mode == "refine" and self.viewer.trainer:
                 self._freeze = gui.add_button("Freeze poses")
                 self._release = gui.add_button("Release poses", visible=False)
-                self._freeze.on_click(lambda _: self._let_poses_move(False))
-                self._release.on_click(lambda _: self._let_poses_move(True))
+                self._freeze.on_click(lambda _: self._set_poses_free(False))
+                self._release.on_click(lambda _: self._set_poses_free(True))
             with gui.add_folder("Show"):
-                for name, label in shown.items():
+                for name, label in labels.items():
                     node = scene.add_frame(f"/{name}", show_axes=False)
                     box = gui.add_checkbox(label, True)
                     box.on_update(lambda event, node=node: setattr(node, "visible", event.target.value))
@@ -139,23 +139,23 @@ class ViewerPanel(ViewerControl):
         self._time.on_update(lambda _: self._go_to_time())
 
     def after_step(self, step: int) -> None:
-        """Note the loss, and bring up to date what is due, if anybody looks; nerfstudio holds its lock meanwhile."""
+        """Record the loss and, with a client connected, run one due task; nerfstudio holds its train lock meanwhile."""
         self._step = step + 1
         if self._viewer is None:
             return
-        if step % self._every == 0 and self._pipeline.last_loss is not None:
+        if step % self._record_interval == 0 and self._pipeline.last_loss is not None:
             self._losses.append((step + 1, self._pipeline.last_loss))
             if len(self._losses) > _MOST_RECORDS:
-                self._losses, self._every = self._losses[::2], 2 * self._every
+                self._losses, self._record_interval = self._losses[::2], 2 * self._record_interval
         now = time.monotonic()
-        due = [chore for chore in self._chores if chore.due_s <= now]
-        if due and self._looked_at and self.viser_server.get_clients():
-            min(due, key=lambda chore: chore.due_s).run()
+        due = [task for task in self._tasks if task.due_s <= now]
+        if due and self._scene_drawn and self.viser_server.get_clients():
+            min(due, key=lambda task: task.due_s).run()
 
-    # Who comes, and where they look from.
+    # Clients and their cameras.
 
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        # viser holds a lock that training may wait for: what takes time is done elsewhere.
+    def _on_connect(self, client: viser.ClientHandle) -> None:
+        # viser holds a lock that training may wait for, so slow work is done in another thread.
         client.camera.fov = vertical_fov_rad(self._pipeline)
         self._look(client, self._pose_at(self._t_us()))
         client.camera.on_update(self._drawn.clear_the_view)
@@ -185,15 +185,15 @@ class ViewerPanel(ViewerControl):
             self._look(client, self._pose_at(self._t_us()))
 
     def _step_back(self, client: viser.ClientHandle | None) -> None:
-        """Look as the camera does now, from so far behind that all keyframes are in view."""
+        """Keep the camera's orientation and move it back until all keyframes are in view."""
         if client is None:
             return
         position, quat_wxyz = self._pose_at(self._t_us())
         places = self._drawn.places()
         turned = rotate(quat_wxyz_conjugate(quat_wxyz).expand(len(places), 4), places - position)
-        aside = turned[:, :2].abs().amax(dim=-1) / math.tan(vertical_fov_rad(self._pipeline) / 2)
+        needed_depth = turned[:, :2].abs().amax(dim=-1) / math.tan(vertical_fov_rad(self._pipeline) / 2)
         back = torch.zeros(3, dtype=torch.float64)
-        back[2] = -1.2 * (aside - turned[:, 2]).amax()
+        back[2] = -1.2 * (needed_depth - turned[:, 2]).amax()
         self._look(client, Poses(position + rotate(quat_wxyz, back), quat_wxyz))
 
     def _go_to_time(self) -> None:
@@ -204,15 +204,15 @@ class ViewerPanel(ViewerControl):
         self._show_moment()
 
     def _draw_all(self, client: viser.ClientHandle) -> None:
-        """What the first to look needs, and nobody before."""
+        """Draw the scene when the first client connects, and the current images for every client."""
         with self._drawing:
-            if not self._looked_at:
+            if not self._scene_drawn:
                 self._drawn.draw_keyframes(self._fly)
                 self._drawn.draw_lines()
                 with self._lock():
                     self._pipeline.fit_display_range()
                     self._draw_curves()
-                self._looked_at = True
+                self._scene_drawn = True
         self._drawn.clear_the_view(client.camera)
         self._show_moment()
 
@@ -221,14 +221,14 @@ class ViewerPanel(ViewerControl):
         assert lock is not None
         return lock
 
-    # What is shown in the panel.
+    # Contents of the panel.
 
     def _show_moment(self) -> None:
-        """The pictures of the time on the slider; of times passed over meanwhile, only the last."""
-        self._wanted += 1
-        while self._wanted != self._shown and self._drawing.acquire(blocking=False):
+        """Show the images of the slider's time; if it changes meanwhile, only its last value is shown next."""
+        self._requested += 1
+        while self._requested != self._shown and self._drawing.acquire(blocking=False):
             try:
-                self._shown = self._wanted
+                self._shown = self._requested
                 self._show_pictures(self._lock())
             finally:
                 self._drawing.release()
@@ -241,7 +241,7 @@ class ViewerPanel(ViewerControl):
                 self._drawing.release()
 
     def _show_pictures(self, lock: Any) -> None:
-        """With a lock to be taken for rendering, or without one where it is held."""
+        """Render and show the images, under the given lock; None if the caller already holds it."""
         t_us = self._t_us()
         half_us = half_window_us(self._pipeline.model.camera_optimizer.keyframe_t_us)
         moment = recorded(self._pipeline, t_us, half_us)
@@ -263,7 +263,7 @@ class ViewerPanel(ViewerControl):
         self._curves.content = _as_markdown(curves([*self._evaluated(), *self._live()]))
 
     def _evaluated(self) -> list[dict[str, Any]]:
-        """What a finished run has on record."""
+        """Return the recorded metrics of a finished run."""
         path = self.viewer.log_filename.parent / "metrics.jsonl"
         if self.viewer.trainer is not None or not path.is_file():
             return []
@@ -278,7 +278,7 @@ class ViewerPanel(ViewerControl):
         losses = [{"step": step, "loss": float(loss)} for step, loss in self._losses]
         return [*losses, *self._records]
 
-    # What buttons and sliders do.
+    # Actions of buttons and sliders.
 
     def _display(self, **settings: float) -> None:
         for name, value in settings.items():
@@ -286,9 +286,9 @@ class ViewerPanel(ViewerControl):
         self.viewer._trigger_rerender()
         self._show_moment()
 
-    def _let_poses_move(self, move: bool) -> None:
-        self._pipeline.model.camera_optimizer.frozen = not move
-        self._freeze.visible, self._release.visible = move, not move
+    def _set_poses_free(self, free: bool) -> None:
+        self._pipeline.model.camera_optimizer.frozen = not free
+        self._freeze.visible, self._release.visible = free, not free
 
     def _save(self, event: viser.GuiEvent) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -304,7 +304,7 @@ def _as_markdown(png: bytes) -> str:
 
 
 class ViewedPipeline(EbarfPipeline):
-    """The pipeline with a panel in nerfstudio's viewer."""
+    """A pipeline with a panel in nerfstudio's viewer."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -313,7 +313,7 @@ class ViewedPipeline(EbarfPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """The viewer is told of every step."""
+        """Return the callbacks, including one that updates the panel after every step."""
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
-        shown = TrainingCallback(after, self.viewer_panel.after_step)
-        return [*super().get_training_callbacks(training_callback_attributes), shown]
+        update = TrainingCallback(after, self.viewer_panel.after_step)
+        return [*super().get_training_callbacks(training_callback_attributes), update]

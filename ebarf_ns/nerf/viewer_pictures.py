@@ -1,4 +1,4 @@
-"""What the viewer's panel shows beside the scene: four pictures of one moment, and curves of a training."""
+"""Images of the viewer's panel: four images of one time, and training curves."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ _ERRORS = {"corrected_position": "ate_m", "corrected_rotation_deg": "rotation_de
 
 @dataclass(frozen=True)
 class Moment:
-    """What there is to see of one moment: 8-bit grey pictures with what they are, and what is said of the time."""
+    """Titled 8-bit grey images of one time, and the label of that time."""
 
     pictures: dict[str, UInt8[np.ndarray, "height width"]]
     says: str
 
 
 def half_window_us(t_us: Tensor) -> int:
-    """Half of what an event picture at each of these times covers."""
+    """Return half the time window of the event images at these times."""
     between = int(t_us.diff().median()) if len(t_us) > 1 else 2 * _LONGEST_HALF_US
     return max(min(between // 2, _LONGEST_HALF_US), 1)
 
 
 def event_picture(pipeline: EbarfPipeline, t_us: int, half_us: int) -> UInt8[np.ndarray, "height width"]:
-    """The events around a moment; plain grey where the recording is gone."""
+    """Return an image of the events around a time; uniform grey if the recording is missing."""
     scene = pipeline.scene
     width, height = scene.camera.width, scene.camera.height
     try:
@@ -62,7 +62,7 @@ def event_picture(pipeline: EbarfPipeline, t_us: int, half_us: int) -> UInt8[np.
 
 
 def recorded(pipeline: EbarfPipeline, t_us: int, half_us: int) -> Moment:
-    """What was recorded at a moment: the events around it, and the frame that is nearest in time."""
+    """Return the recorded events around a time, and the frame nearest to it."""
     pictures = {f"events, {2e-3 * half_us:.3g} ms": event_picture(pipeline, t_us, half_us)}
     frame = min(pipeline.scene.frames, key=lambda frame: abs(frame.t_us - t_us), default=None)
     if frame and frame.path.is_file():
@@ -75,8 +75,7 @@ def recorded(pipeline: EbarfPipeline, t_us: int, half_us: int) -> Moment:
 
 @torch.no_grad()
 def rendered(pipeline: EbarfPipeline, t_us: int, half_us: int) -> dict[str, UInt8[np.ndarray, "height width"]]:
-    """What the field shows then, with fewer pixels than a large camera has: log brightness, and the events that its
-    change over the same time would make."""
+    """Return the field's log brightness and its predicted events around a time, at reduced resolution."""
     pixel = pixel_lattice(pipeline.scene.camera, _WIDEST_PX)
     events = predicted_events(pipeline, t_us, half_us, pixel)
     grey = pipeline.model.grey(brightness_at(pipeline, t_us, pixel))
@@ -87,7 +86,7 @@ def rendered(pipeline: EbarfPipeline, t_us: int, half_us: int) -> dict[str, UInt
 
 
 def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width"]], width: int = 2 * 300) -> bytes:
-    """Pictures in two columns, each with its name above it, as a PNG."""
+    """Return images in two columns, each below its title, as a PNG."""
     half, bar = width // 2 - 4, 34
     tiles = []
     for name, grey in pictures.items():
@@ -107,16 +106,19 @@ def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width"]], width: 
 
 
 def curves(records: Sequence[dict[str, Any]], width: int = 2 * 300) -> bytes:
-    """Loss, unexplained events, and how far the poses have moved, over the steps, as a PNG; dotted their errors.
+    """Return curves of loss, unexplained events and pose corrections over the steps, as a PNG; pose errors are dotted.
 
-    A picture, since viser's plots are wider than its panel and bring 3 MB of script along.
+    viser's own plots are wider than its panel and load 3 MB of scripts.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width / 100, 1.5 * width / 100), dpi=100, layout="constrained", facecolor="#242424")
     rows = figure.subplots(len(_CURVES), sharex=True)
     for axes, (name, title, scale) in zip(rows, _CURVES, strict=True):
-        drawn = {name: ("#ff7f0e", "-", "moved by training"), _ERRORS.get(name): ("#2ca02c", ":", "off the reference")}
+        drawn = {
+            name: ("#ff7f0e", "-", "moved by training"),
+            _ERRORS.get(name): ("#2ca02c", ":", "error vs. reference"),
+        }
         for key, (color, dashes, legend) in drawn.items():
             known = [(one["step"], one[key]) for one in records if one.get(key) is not None]
             if known:

@@ -1,4 +1,4 @@
-"""Whole views, for people to look at: a camera and a picture each, and where spirals begin."""
+"""Full views for display: a camera and an image each, and the starting view of spirals."""
 
 import math
 import random
@@ -17,12 +17,12 @@ from ebarf_ns.errors import EbarfError
 from ebarf_ns.events.recording import RecordingFile, accumulate
 from ebarf_ns.scene import Scene
 
-# Of the sine between view and vertical; a spiral's views turn by the hundredth part of a degree against each other.
+# Minimum sine of the angle between view and vertical. The views of a spiral turn by only 0.01 degrees.
 _LEAST_TILT = 0.1
 
 
 class EventDataset(InputDataset):
-    """Cameras with a picture each: the frame taken there, or else the events around that keyframe."""
+    """Cameras with one image each: the frame taken there, or else the events around that keyframe."""
 
     def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
@@ -31,11 +31,11 @@ class EventDataset(InputDataset):
         self.t_us: Tensor = self.cameras.metadata["camera_t_us"][:, 0]
 
     def show_from(self, cameras: Cameras) -> None:
-        """Take these cameras for those of the views, for everybody who asks."""
+        """Replace the cameras of the views, in the dataset and in its data parser outputs."""
         self.cameras = self._dataparser_outputs.cameras = cameras
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """8-bit grey in three channels, for people to look at; evaluation reads the frames themselves."""
+        """Return an 8-bit grey image in three channels, for display only; evaluation reads the frames themselves."""
         path = self._dataparser_outputs.image_filenames[image_idx]
         grey = self._read_frame(path) if path.is_file() else self._events_around(image_idx)
         size = (int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx]))
@@ -55,28 +55,28 @@ class EventDataset(InputDataset):
             file = RecordingFile(self.scene.events, camera.width, camera.height)
             return accumulate(file.window(t_us - half_us, t_us + half_us), camera.width, camera.height)
         except EbarfError:
-            # A trained run can be looked at when its recording is gone.
+            # A trained run can still be viewed after its recording was deleted.
             return np.full((camera.height, camera.width), 128, np.uint8)
 
 
 def for_people(linear: Float[np.ndarray, "height width"]) -> np.ndarray:
-    """A linear frame as 8-bit grey with the usual gamma."""
+    """Return a linear frame as 8-bit grey with a gamma of 2.2."""
     return (np.clip(linear / max(linear.max(), 1e-9), 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
 
 
 class SpiralStart(RandIndicesEvalDataloader):
-    """Random views, and by its number the view that ``ns-render spiral`` begins with.
+    """Loader of random views, and of the view with a given index, from which ``ns-render spiral`` starts.
 
-    nerfstudio takes that camera's view direction in the world for "up" in the camera's own frame, by which spirals are
-    rolled. The camera is given rolled by as much the other way, and tilted where it looks along the world's z: there,
-    its "up" would be along the view.
+    nerfstudio uses the camera's viewing direction in the world as "up" in the camera's own frame, which rolls the
+    spiral. The camera is therefore returned with the opposite roll. A camera that looks along the world's z axis is
+    also tilted, because its "up" would otherwise be parallel to the view.
     """
 
     def __next__(self) -> tuple[Cameras, dict]:
         return super().get_camera(random.randint(0, len(self.cameras) - 1))
 
     def get_camera(self, image_idx: int = 0) -> tuple[Cameras, dict]:
-        """The view of that number, such that a spiral around it stands upright."""
+        """Return the view with this index, rolled so that a spiral around it is upright."""
         camera, batch = super().get_camera(image_idx)
         rolled = camera[...]
         rolled.camera_to_worlds = torch.stack([upright_start(one) for one in camera.camera_to_worlds])
@@ -84,23 +84,26 @@ class SpiralStart(RandIndicesEvalDataloader):
 
 
 def upright_start(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
-    """What ``get_spiral_path`` has to begin with, for its views to stand as this camera does (nerfstudio's axes)."""
+    """Return the pose from which ``get_spiral_path`` makes views as upright as this camera (nerfstudio's axes)."""
     rotation, position = camera_to_world[:, :3].double(), camera_to_world[:, 3:]
     x, y, _ = rotation[:, 2].tolist()
     if math.hypot(x, y) < _LEAST_TILT:
-        # About the camera's x, towards where its backward axis is further from the world's z.
-        most = max((_turn(0, sign * 1.5 * _LEAST_TILT) for sign in (1, -1)), key=lambda turn: _off_z(rotation @ turn))
-        rotation = rotation @ most
+        # Tilt about the camera's x axis, to the side where its backward axis is further from the world's z axis.
+        tilt = max(
+            (_axis_rotation(0, sign * 1.5 * _LEAST_TILT) for sign in (1, -1)),
+            key=lambda candidate: _sine_from_z(rotation @ candidate),
+        )
+        rotation = rotation @ tilt
         x, y, _ = rotation[:, 2].tolist()
     roll_rad = math.atan2(-x, y)
-    return torch.cat([(rotation @ _turn(2, -roll_rad)).to(position), position], dim=1)
+    return torch.cat([(rotation @ _axis_rotation(2, -roll_rad)).to(position), position], dim=1)
 
 
-def _off_z(rotation: Float[Tensor, "3 3"]) -> float:
+def _sine_from_z(rotation: Float[Tensor, "3 3"]) -> float:
     return float(rotation[:2, 2].norm())
 
 
-def _turn(axis: int, angle_rad: float) -> Float[Tensor, "3 3"]:
+def _axis_rotation(axis: int, angle_rad: float) -> Float[Tensor, "3 3"]:
     generator = torch.zeros(3, 3, dtype=torch.float64)
     generator[(axis + 2) % 3, (axis + 1) % 3], generator[(axis + 1) % 3, (axis + 2) % 3] = angle_rad, -angle_rad
     return torch.linalg.matrix_exp(generator)

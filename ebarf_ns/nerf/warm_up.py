@@ -1,4 +1,4 @@
-"""Kernels compiled before the clock of a training starts."""
+"""Compilation of kernels before the training clock starts."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from nerfstudio.utils.rich_utils import CONSOLE
 if TYPE_CHECKING:
     from ebarf_ns.nerf.pipeline import EbarfPipeline
 
-_WORTH_SAYING_S = 2.0
+_REPORTED_ABOVE_S = 2.0
 
 
 def compile_kernels(pipeline: EbarfPipeline) -> float:
-    """Draw a batch, render it and differentiate it once; returns the seconds that this took.
+    """Render one batch and compute its gradients; returns the duration in seconds.
 
-    Numba and Triton compile a kernel when it is first called, once for each machine and version. Nothing of the model
-    changes: it is rendered as in an evaluation, and its gradients are thrown away.
+    Numba and Triton compile a kernel on its first call, once per machine and version. The model does not change: it
+    renders in evaluation mode, and the gradients are discarded.
     """
     started = monotonic()
     model, was_training = pipeline.model, pipeline.model.training
-    with CONSOLE.status("compiling kernels for this processor, which happens once"):
+    with CONSOLE.status("compiling kernels for this processor (once only)"):
         try:
             model.eval()
             rays, _ = pipeline.datamanager.next_train(0)
             outputs = model(rays)
-            learned = [one for one in (*model.renderer.parameters(), *model.pose_parameters()) if one.requires_grad]
+            parameters = (*model.renderer.parameters(), *model.pose_parameters())
+            learned = [parameter for parameter in parameters if parameter.requires_grad]
             torch.autograd.grad(outputs["brightness"].sum(), learned, allow_unused=True)
         finally:
             model.train(was_training)
     seconds = monotonic() - started
-    if seconds > _WORTH_SAYING_S:
-        CONSOLE.print(f"kernels compiled in {seconds:.0f} s, once for this machine; not part of the training time")
+    if seconds > _REPORTED_ABOVE_S:
+        CONSOLE.print(f"compiled kernels in {seconds:.0f} s (once per machine, not counted as training time)")
     return seconds

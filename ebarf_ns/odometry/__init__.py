@@ -1,1 +1,1 @@
-"""An initial trajectory from events alone: event images, feature tracks through them, structure from motion."""
+"""An initial trajectory from events alone: event images, feature tracks, and structure from motion."""

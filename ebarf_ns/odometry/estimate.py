@@ -1,7 +1,7 @@
-"""From a recording and its camera to an initial trajectory, or to the reason why there is none.
+"""Estimation of an initial trajectory from a recording and its camera, or the reason why there is none.
 
-Event images, tracks through them, a map of all tracks, and two more of either half of them, which know nothing of each
-other: where these disagree, no reprojection error makes up for it.
+Features are tracked through event images and mapped. Each half of the tracks is also mapped independently of the other:
+where the two maps disagree, the trajectory is rejected, however small the reprojection error is.
 """
 
 from __future__ import annotations
@@ -30,30 +30,31 @@ if TYPE_CHECKING:
     from ebarf_ns.events.recording import RecordingFile
     from ebarf_ns.geometry.cameras import Camera
 
-_SHORTEST_US, _FEWEST_KEYFRAMES, _IMAGES_A_KEYFRAME = 50_000, 12, 4
+_SHORTEST_US, _FEWEST_KEYFRAMES, _IMAGES_PER_KEYFRAME = 50_000, 12, 4
 _PILOTS, _PILOT_S, _USUAL_PX_S = 8, 0.01, 150.0
-_MEMORY_S, _KEYFRAME_S = (0.005, 0.3), (0.004, 0.1)
-"""Shortest and longest time constant of event images, and time between keyframes."""
+_TIME_CONSTANT_S, _KEYFRAME_S = (0.005, 0.3), (0.004, 0.1)
+"""Bounds of the time constant of event images, and of the time between keyframes."""
 _SHORTEST_TRACK, _FEWEST_TRACKS = 3, 20
 _LEAST_VIEW, _FEWEST_MAPPED, _LEAST_SPAN = 0.45, 100, 0.5
-_STILL_PX, _NO_PARALLAX_PX, _ROTATION_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.0, 1.5
-_LASTING = 0.3
-"""Share of the keyframes that a track must be seen in, on average, for a rotation to be told from a translation."""
+_LEAST_MOTION_PX, _NO_PARALLAX_PX, _ROTATION_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.0, 1.5
+_LEAST_TRACK_SHARE = 0.3
+"""Share of the keyframes that tracks must span on average to distinguish rotation from translation."""
 _LEAST_INLIERS = 0.6
-_LEAST_GAIN, _FAR = 1.5, 0.05
-"""By how much a map must explain tracks better than a rotation does; and inverse depth over the usual one below which
-a point is as good as infinitely far."""
-_TRY_PARALLAX = "move the camera sideways by a tenth of the distance of what it sees, or give a trajectory"
+_LEAST_GAIN, _LEAST_INVERSE_DEPTH = 1.5, 0.05
+"""Least ratio of the errors of a rotation to those of a map; and ratio to the median inverse depth below which the
+distance of a point is not determined."""
+_TRY_PARALLAX = "move the camera sideways by a tenth of the distance to the scene, or provide a trajectory"
+_MOVING_OBJECTS = "the scene may have moving objects or too little texture"
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An initial trajectory that the method vouches for."""
+    """An initial trajectory that passed all checks."""
 
     trajectory: Trajectory
-    """In units of the usual distance of what is seen."""
+    """In units of the median distance of the points."""
     points: Float64[np.ndarray, "points 3"]
-    """None of a rotation alone."""
+    """Empty if only the rotation was estimated."""
     position_std: Float64[np.ndarray, "keyframes"]
     rotation_std_rad: Float64[np.ndarray, "keyframes"]
     quality: Quality
@@ -66,91 +67,89 @@ def estimated(
     threshold_ratio: float = 1.0,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Estimate:
-    """The trajectory of a recording; raises :class:`OdometryError`, which says why not and what to try."""
+    """Estimate the trajectory of a recording; raises :class:`OdometryError` with the reason and what to try."""
     count, first_us, last_us = file.span()
     if last_us - first_us < _SHORTEST_US:
         raise OdometryError(
-            f"{file.path}: {count:,} events over {(last_us - first_us) / 1000:.1f} ms, too short a time for parallax; "
-            f"expected {_SHORTEST_US // 1000} ms or more"
+            f"{file.path}: {count:,} events in {(last_us - first_us) / 1000:.1f} ms, too short for parallax; expected "
+            f"{_SHORTEST_US // 1000} ms or more"
         )
     progress("counting events")
     pace, hot = paced(file)
-    progress("following features")
+    progress("tracking features")
     tracks, t_us = _tracks(file, camera, settings, pace, hot, threshold_ratio)
-    by_keyframe = np.bincount(tracks.image, minlength=len(t_us))
-    if np.median(by_keyframe) < _FEWEST_TRACKS:
+    per_keyframe = np.bincount(tracks.image, minlength=len(t_us))
+    if np.median(per_keyframe) < _FEWEST_TRACKS:
         raise OdometryError(
-            f"{file.path}: too few features, {np.median(by_keyframe):.0f} in most keyframes are followed through "
-            f"{_SHORTEST_TRACK}, expected {_FEWEST_TRACKS} or more; a scene with more texture, or less noise"
+            f"{file.path}: too few features, a median of {np.median(per_keyframe):.0f} per keyframe is tracked through "
+            f"{_SHORTEST_TRACK} keyframes, expected {_FEWEST_TRACKS} or more; try more texture, or less noise"
         )
     focal_px = float(np.sqrt(camera.fx * camera.fy))
-    seen = view_share(tracks, camera)
-    if seen < _LEAST_VIEW:
+    view_covered = view_share(tracks, camera)
+    if view_covered < _LEAST_VIEW:
         raise OdometryError(
-            f"{file.path}: features in {seen:.0%} of the view alone, expected {_LEAST_VIEW:.0%} or more; "
-            "what moves may be an object rather than the camera"
+            f"{file.path}: features cover only {view_covered:.0%} of the view, expected {_LEAST_VIEW:.0%} or more; "
+            "an object may be moving instead of the camera"
         )
     progress("mapping")
     rotation = turned(tracks)
     if rotation is None:
         raise OdometryError(
-            f"{file.path}: too few features, two keyframes one after the other share hardly any; a scene with more "
-            "texture, or a slower motion"
+            f"{file.path}: too few features, consecutive keyframes share hardly any; try more texture, or slower motion"
         )
-    return _judged(file, tracks, t_us, rotation, focal_px, seen, progress)
+    return _checked(file, tracks, t_us, rotation, focal_px, view_covered, progress)
 
 
-def _judged(
+def _checked(
     file: RecordingFile, tracks: Tracks, t_us: Int64[np.ndarray, "keyframes"], rotation: Turned, focal_px: float,
-    seen: float, progress: Callable[[str], None],
+    view_covered: float, progress: Callable[[str], None],
 ) -> Estimate:  # fmt: skip
-    """The estimate that stands every test, a rotation where that explains the tracks; or the reason for none."""
+    """Return an estimate that passes all checks, rotation only if that explains the tracks; raises the reason."""
     parallax_px = focal_px * float(np.median(rotation.stray_rad))
-    turn_px = focal_px * float(Rotation.from_matrix(rotation.rotation @ rotation.rotation[0].T).magnitude().max())
-    if parallax_px < _LITTLE_PARALLAX_PX and turn_px < _STILL_PX:
+    rotation_px = focal_px * float(Rotation.from_matrix(rotation.rotation @ rotation.rotation[0].T).magnitude().max())
+    if parallax_px < _LITTLE_PARALLAX_PX and rotation_px < _LEAST_MOTION_PX:
         raise OdometryError(
-            f"{file.path}: no motion, features stay within {max(parallax_px, turn_px):.1f} px; expected a camera that "
-            "moves"
+            f"{file.path}: no motion, features stay within {max(parallax_px, rotation_px):.1f} px; expected a moving "
+            "camera"
         )
-    # Where tracks are short, a rotation can follow what is a translation, and drift with it.
-    lasting = len(tracks.track) / len(rotation.track) >= _LASTING * len(t_us)
-    if parallax_px < _NO_PARALLAX_PX and lasting:
-        return _of_rotation(tracks, t_us, rotation, focal_px, seen)
+    # With short tracks, a rotation can absorb a translation, and drifts.
+    long_tracks = len(tracks.track) / len(rotation.track) >= _LEAST_TRACK_SHARE * len(t_us)
+    if parallax_px < _NO_PARALLAX_PX and long_tracks:
+        return _rotation_estimate(tracks, t_us, rotation, focal_px, view_covered)
     whole = mapped(tracks, focal_px, rotation)
-    found, gain, why = None, np.inf, f"no two keyframes begin a map; {_TRY_PARALLAX}"
+    found, gain, reason = None, np.inf, f"no pair of keyframes can initialize the map; {_TRY_PARALLAX}"
     if whole is not None:
         kept = explained(whole, tracks)
-        inside = kept[tracks.image]
-        inliers = float((whole.residuals_px() < INLIER_PX)[inside].mean()) if inside.any() else 0.0
-        why = (
-            f"one camera's motion explains {inliers:.0%} of the features' in {kept.sum()} of {len(t_us)} keyframes; "
-            "objects that move by themselves, or too little texture?"
+        in_kept = kept[tracks.image]
+        inliers = float((whole.residuals_px() < INLIER_PX)[in_kept].mean()) if in_kept.any() else 0.0
+        reason = (
+            f"camera motion explains {inliers:.0%} of the observations in {kept.sum()} of {len(t_us)} keyframes; "
+            f"{_MOVING_OBJECTS}"
         )
-        gain = parallax_px / max(_by_track_px(whole), 1e-9)
+        gain = parallax_px / max(_track_error_px(whole), 1e-9)
         if gain < _LEAST_GAIN:
-            why = f"no parallax, a rotation leaves {parallax_px:.1f} px unexplained; {_TRY_PARALLAX}"
+            reason = f"no parallax, rotation alone leaves {parallax_px:.1f} px unexplained; {_TRY_PARALLAX}"
         elif inliers >= _LEAST_INLIERS:
             progress("checking")
             halves = [mapped(halved(tracks, which), focal_px, rotation) for which in (0, 1)]
-            why = f"either half of the features tells another motion; {_TRY_PARALLAX}"
+            reason = f"the two halves of the features give different motions; {_TRY_PARALLAX}"
             if halves[0] is not None and halves[1] is not None:
                 found = agreement(whole, halves[0], halves[1], kept)
     if whole is not None and found is not None:
-        estimate = _of_map(whole, found, t_us, focal_px, parallax_px, seen)
+        estimate = _map_estimate(whole, found, t_us, focal_px, parallax_px, view_covered)
         if estimate.quality.tracks >= _FEWEST_MAPPED and estimate.quality.span_share >= _LEAST_SPAN:
             return estimate
-        why = (
-            f"{estimate.quality.tracks} features over {estimate.quality.span_share:.0%} of the time tell of one "
-            f"motion, expected {_FEWEST_MAPPED} over {_LEAST_SPAN:.0%}; objects that move by themselves, or too little "
-            "texture?"
+        reason = (
+            f"{estimate.quality.tracks} features over {estimate.quality.span_share:.0%} of the time agree on one "
+            f"motion, expected {_FEWEST_MAPPED} over {_LEAST_SPAN:.0%}; {_MOVING_OBJECTS}"
         )
-    if parallax_px < _ROTATION_PX and (lasting or gain < _LEAST_GAIN):
-        return _of_rotation(tracks, t_us, rotation, focal_px, seen)
-    raise OdometryError(f"{file.path}: no trajectory to vouch for: {why}")
+    if parallax_px < _ROTATION_PX and (long_tracks or gain < _LEAST_GAIN):
+        return _rotation_estimate(tracks, t_us, rotation, focal_px, view_covered)
+    raise OdometryError(f"{file.path}: no reliable trajectory: {reason}")
 
 
-def _by_track_px(whole: Map) -> float:
-    """Median by track of the root mean square residual."""
+def _track_error_px(whole: Map) -> float:
+    """Return the median over tracks of the root mean square reprojection error."""
     residual = whole.residuals_px()
     known = np.isfinite(residual)
     track = whole.tracks.track[known]
@@ -158,17 +157,22 @@ def _by_track_px(whole: Map) -> float:
     return float(np.median(np.sqrt(np.bincount(track, residual[known] ** 2)[count > 0] / count[count > 0])))
 
 
-def _of_map(
-    whole: Map, found: Agreement, t_us: Int64[np.ndarray, "keyframes"], focal_px: float, parallax_px: float, seen: float
+def _map_estimate(
+    whole: Map,
+    found: Agreement,
+    t_us: Int64[np.ndarray, "keyframes"],
+    focal_px: float,
+    parallax_px: float,
+    view_covered: float,
 ) -> Estimate:
     bundle, image = whole.bundle, found.image
     residual = whole.residuals_px()[np.isin(whole.tracks.image, image)]
     good = np.nonzero((whole.residuals_px() < INLIER_PX) & np.isin(whole.tracks.image, image))[0]
-    number = np.unique(whole.tracks.track[good])
-    # The others are anywhere: nothing tells how far.
-    number = number[bundle.point[number, 2] > _FAR * float(np.median(bundle.point[number, 2]))]
-    points = bundle.positions()[number]
-    usual = float(np.median(np.linalg.norm(points - np.median(bundle.centre[image], axis=0), axis=1)))
+    track = np.unique(whole.tracks.track[good])
+    # The distance of the other points is not determined.
+    track = track[bundle.point[track, 2] > _LEAST_INVERSE_DEPTH * float(np.median(bundle.point[track, 2]))]
+    points = bundle.positions()[track]
+    distance = float(np.median(np.linalg.norm(points - np.median(bundle.centre[image], axis=0), axis=1)))
     quat_xyzw = Rotation.from_matrix(bundle.rotation[image].transpose(0, 2, 1)).as_quat()
     quality = Quality(
         kind="six degrees of freedom",
@@ -179,16 +183,16 @@ def _of_map(
         reprojection_px=float(np.sqrt(np.mean(residual[residual < INLIER_PX] ** 2))),
         parallax_px=parallax_px,
         disagreement=found.apart,
-        view_share=seen,
+        view_share=view_covered,
     )
-    trajectory = _trajectory(t_us[image], bundle.centre[image] / usual, quat_xyzw)
-    return Estimate(trajectory, points / usual, found.position_std / usual, found.rotation_std_rad, quality)
+    trajectory = _trajectory(t_us[image], bundle.centre[image] / distance, quat_xyzw)
+    return Estimate(trajectory, points / distance, found.position_std / distance, found.rotation_std_rad, quality)
 
 
-def _of_rotation(
-    tracks: Tracks, t_us: Int64[np.ndarray, "keyframes"], rotation: Turned, focal_px: float, seen: float
+def _rotation_estimate(
+    tracks: Tracks, t_us: Int64[np.ndarray, "keyframes"], rotation: Turned, focal_px: float, view_covered: float
 ) -> Estimate:
-    """A camera that turns where it is; what its tracks leave unexplained may be turns or shifts."""
+    """Return the estimate of a camera that only rotates; its residuals count as rotation uncertainty."""
     stray_px = focal_px * rotation.stray_rad
     good = stray_px < INLIER_PX
     quality = Quality(
@@ -200,12 +204,12 @@ def _of_rotation(
         reprojection_px=float(np.sqrt(np.mean(stray_px[good] ** 2))),
         parallax_px=float(np.median(stray_px)),
         disagreement=None,
-        view_share=seen,
+        view_share=view_covered,
     )
     quat_xyzw = Rotation.from_matrix(rotation.rotation.transpose(0, 2, 1)).as_quat()
     std_rad = np.full(len(t_us), quality.parallax_px / focal_px)
-    nothing = np.zeros((len(t_us), 3))
-    return Estimate(_trajectory(t_us, nothing, quat_xyzw), nothing[:0], np.full(len(t_us), np.nan), std_rad, quality)
+    zeros = np.zeros((len(t_us), 3))
+    return Estimate(_trajectory(t_us, zeros, quat_xyzw), zeros[:0], np.full(len(t_us), np.nan), std_rad, quality)
 
 
 def _trajectory(t_us: np.ndarray, position: np.ndarray, quat_xyzw: np.ndarray) -> Trajectory:
@@ -217,32 +221,32 @@ def _tracks(
     file: RecordingFile, camera: Camera, settings: OdometrySettings, pace: Pace, hot: Bool[np.ndarray, "pixels"],
     threshold_ratio: float,
 ) -> tuple[Tracks, Int64[np.ndarray, "keyframes"]]:  # fmt: skip
-    """Tracks of three keyframes or more, and the keyframes' times, from the first event to the last."""
+    """Return tracks of three or more keyframes, and the keyframes' times, from the first event to the last."""
     speed_px_s = _USUAL_PX_S
     for _ in range(2):
         speed_px_s = _speed_px_s(file, pace, hot, threshold_ratio, settings.memory_px / speed_px_s) or speed_px_s
     length_s = float(pace.seconds[-1])
-    memory_s = float(np.clip(settings.memory_px / speed_px_s, *_MEMORY_S))
+    time_constant_s = float(np.clip(settings.memory_px / speed_px_s, *_TIME_CONSTANT_S))
     keyframe_s = float(np.clip(settings.keyframe_px / speed_px_s, *_KEYFRAME_S))
     keyframes = max(round(length_s / keyframe_s), _FEWEST_KEYFRAMES)
-    t_us = np.unique(pace.when_us(np.linspace(0, length_s, _IMAGES_A_KEYFRAME * keyframes + 1)))
-    images = event_images(file, pace, t_us, memory_s, threshold_ratio, hot)
-    tracks = followed(images, camera, _IMAGES_A_KEYFRAME)
-    return tracks.select(tracks.lengths()[tracks.track] >= _SHORTEST_TRACK), t_us[::_IMAGES_A_KEYFRAME]
+    t_us = np.unique(pace.when_us(np.linspace(0, length_s, _IMAGES_PER_KEYFRAME * keyframes + 1)))
+    images = event_images(file, pace, t_us, time_constant_s, threshold_ratio, hot)
+    tracks = followed(images, camera, _IMAGES_PER_KEYFRAME)
+    return tracks.select(tracks.lengths()[tracks.track] >= _SHORTEST_TRACK), t_us[::_IMAGES_PER_KEYFRAME]
 
 
 def _speed_px_s(
-    file: RecordingFile, pace: Pace, hot: Bool[np.ndarray, "pixels"], threshold_ratio: float, memory_s: float
+    file: RecordingFile, pace: Pace, hot: Bool[np.ndarray, "pixels"], threshold_ratio: float, time_constant_s: float
 ) -> float | None:
-    """How fast things usually move across the picture, by a few pairs of pictures; None where nothing is found."""
+    """Return the median image speed over a few pairs of event images, or None if no feature is tracked."""
     length_s = float(pace.seconds[-1])
-    apart_s = min(_PILOT_S, length_s / 20)
-    memory_s = float(np.clip(memory_s, *_MEMORY_S))
+    interval_s = min(_PILOT_S, length_s / 20)
+    time_constant_s = float(np.clip(time_constant_s, *_TIME_CONSTANT_S))
     speeds = []
-    for moment_s in length_s * (np.arange(_PILOTS) + 0.5) / _PILOTS:
-        t_us = np.unique(pace.when_us(np.array([max(moment_s - 3 * memory_s, 0), moment_s, moment_s + apart_s])))
-        *_, one, two = event_images(file, pace, t_us, memory_s, threshold_ratio, hot)
+    for time_s in length_s * (np.arange(_PILOTS) + 0.5) / _PILOTS:
+        t_us = np.unique(pace.when_us(np.array([max(time_s - 3 * time_constant_s, 0), time_s, time_s + interval_s])))
+        *_, one, two = event_images(file, pace, t_us, time_constant_s, threshold_ratio, hot)
         moved_px = displacements_px(one, two)
         if len(moved_px):
-            speeds.append(float(np.median(moved_px)) / apart_s)
+            speeds.append(float(np.median(moved_px)) / interval_s)
     return max(float(np.median(speeds)), 1.0) if speeds else None

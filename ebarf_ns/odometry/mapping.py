@@ -1,4 +1,4 @@
-"""A map of tracks: begun where parallax is large, extended keyframe by keyframe to both sides, adjusted all the way."""
+"""Mapping of tracks: a map starts where parallax is large, and grows keyframe by keyframe in both directions."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float64, Int64
 
 _GAPS = (5, 8, 12, 18, 27)
-"""How far apart the two keyframes are that a map begins with."""
-_FEWEST_SHARED, _TRIED, _ENOUGH_PX = 25, 6, 25.0
-_FEWEST_SEEN, _LEAST_SHARE, _INLIER_PX = 12, 0.4, 3.0
-_LOCAL, _BEHIND, _WHOLE_EVERY, _STRETCH = 8, 30, 12, 120
-_ROBUST_PX, _LOOSE_PX, _SPARE = 0.7, 2.0, 3
+"""Distances, in keyframes, between the two keyframes that initialize a map."""
+_FEWEST_SHARED, _MOST_PAIRS, _AMPLE_PARALLAX_PX = 25, 6, 25.0
+_FEWEST_POINTS, _LEAST_INLIER_SHARE, _INLIER_PX = 12, 0.4, 3.0
+_LOCAL_KEYFRAMES, _CONTEXT_KEYFRAMES, _WHOLE_INTERVAL, _STRETCH = 8, 30, 12, 120
+_ROBUST_PX, _LOOSE_PX, _NUMBERS_PER_TRACK = 0.7, 2.0, 3
 _DEPTHS = np.array([0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 8.0])
-"""Inverse depths over the usual one that a new point is tried at."""
+"""Inverse depths at which a new point is tried, relative to the usual one."""
 
 
 @dataclass
 class Map:
-    """Keyframes with a pose, and tracks with a point; numbers are those of the tracks."""
+    """Poses of keyframes and points of tracks, indexed as in the tracks."""
 
     tracks: Tracks
     focal_px: float
@@ -36,10 +36,10 @@ class Map:
     posed: Bool[np.ndarray, "images"]
     pointed: Bool[np.ndarray, "tracks"]
     used: Bool[np.ndarray, "tracks"]
-    """Whether there is such a track; some numbers are left for those that are split."""
+    """Whether the track exists; spare numbers are reserved for tracks that are split off."""
 
     def residuals_px(self, rows: Any = slice(None)) -> Float64[np.ndarray, "observations"]:
-        """Distances between observations, all or some, and their points; infinite without pose or point."""
+        """Return the reprojection errors of all or some observations; infinite without a pose or a point."""
         image, track, plane = self.tracks.image[rows], self.tracks.track[rows], self.tracks.plane[rows]
         known = self.posed[image] & self.pointed[track]
         residual = np.full(len(known), np.inf)
@@ -49,27 +49,27 @@ class Map:
 
 
 def mapped(tracks: Tracks, focal_px: float, turned: Turned) -> Map | None:
-    """The map that reaches furthest from the best beginning; None where nothing has parallax enough to begin."""
+    """Return the map grown from the best initial pair of keyframes; None if no pair has enough parallax."""
     best: Map | None = None
-    for first, last in _beginnings(tracks, focal_px, turned):
-        begun = _begun(tracks, focal_px, turned, first, last)
-        if begun is not None and (best is None or _score(begun) > _score(best)):
-            best = begun
+    for first, last in _initial_pairs(tracks, focal_px, turned):
+        initial = _initial_map(tracks, focal_px, turned, first, last)
+        if initial is not None and (best is None or _score(initial) > _score(best)):
+            best = initial
     if best is None:
         return None
     images = np.nonzero(best.posed)[0]
     for step in (1, -1):
-        at = int(images[-1] if step > 0 else images[0])
-        while 0 <= at + step < len(best.posed) and _extended(best, at, step):
-            at += step
-            if at % _WHOLE_EVERY == 0:
+        current = int(images[-1] if step > 0 else images[0])
+        while 0 <= current + step < len(best.posed) and _extend(best, current, step):
+            current += step
+            if current % _WHOLE_INTERVAL == 0:
                 _adjust_whole(best, rounds=6)
     _adjust_whole(best, rounds=40)
     return best
 
 
-def _beginnings(tracks: Tracks, focal_px: float, turned: Turned) -> list[tuple[int, int]]:
-    """Pairs of keyframes with many shared tracks that rotation alone leaves apart, the most promising first."""
+def _initial_pairs(tracks: Tracks, focal_px: float, turned: Turned) -> list[tuple[int, int]]:
+    """Return pairs of keyframes with many common tracks and much parallax, the most promising first."""
     count = len(turned.rotation)
     rows = [np.nonzero(tracks.image == image)[0] for image in range(count)]
     found = []
@@ -83,27 +83,27 @@ def _beginnings(tracks: Tracks, focal_px: float, turned: Turned) -> list[tuple[i
                 break
             relative = turned.rotation[last] @ turned.rotation[first].T
             ray = np.concatenate([tracks.plane[rows[first][one]], np.ones((len(one), 1))], axis=1) @ relative.T
-            away = focal_px * np.linalg.norm(ray[:, :2] / ray[:, 2:] - tracks.plane[rows[last][two]], axis=1)
-            found.append((min(float(np.median(away)), _ENOUGH_PX) * np.sqrt(len(one)), first, last))
+            error = focal_px * np.linalg.norm(ray[:, :2] / ray[:, 2:] - tracks.plane[rows[last][two]], axis=1)
+            found.append((min(float(np.median(error)), _AMPLE_PARALLAX_PX) * np.sqrt(len(one)), first, last))
     chosen: list[tuple[int, int]] = []
     for _, first, last in sorted(found, reverse=True):
         if all(abs(first - one) + abs(last - two) > 6 for one, two in chosen):
             chosen.append((first, last))
-    return chosen[:_TRIED]
+    return chosen[:_MOST_PAIRS]
 
 
-def _begun(tracks: Tracks, focal_px: float, turned: Turned, first: int, last: int) -> Map | None:
-    """A map of the keyframes between two, from the essential matrix of these."""
+def _initial_map(tracks: Tracks, focal_px: float, turned: Turned, first: int, last: int) -> Map | None:
+    """Return a map of the keyframes from first to last, from the essential matrix of these two, or None."""
     one, two = (np.nonzero(tracks.image == image)[0] for image in (first, last))
     _, a, b = np.intersect1d(tracks.track[one], tracks.track[two], return_indices=True)
-    at, then = focal_px * tracks.plane[one[a]], focal_px * tracks.plane[two[b]]
+    at_first, at_last = focal_px * tracks.plane[one[a]], focal_px * tracks.plane[two[b]]
     matrix = np.diag([focal_px, focal_px, 1.0])
-    essential, inliers = cv2.findEssentialMat(at, then, matrix, cv2.USAC_MAGSAC, 0.999, 1.5)
+    essential, inliers = cv2.findEssentialMat(at_first, at_last, matrix, cv2.USAC_MAGSAC, 0.999, 1.5)
     if essential is None or essential.shape != (3, 3):
         return None
-    _, rotation, translation, _ = cv2.recoverPose(essential, at, then, matrix, mask=inliers)
+    _, rotation, translation, _ = cv2.recoverPose(essential, at_first, at_last, matrix, mask=inliers)
     count, known = len(turned.rotation), int(tracks.track.max()) + 1
-    number = _SPARE * known
+    number = _NUMBERS_PER_TRACK * known
     tracks = Tracks(tracks.track.copy(), tracks.image, tracks.plane)
     bundle = Bundle(
         turned.rotation.copy(), np.zeros((count, 3)), np.zeros((number, 3)), np.tile(np.eye(3), (number, 1, 1)),
@@ -111,69 +111,69 @@ def _begun(tracks: Tracks, focal_px: float, turned: Turned, first: int, last: in
     )  # fmt: skip
     images = np.arange(first, last + 1)
     share = (images - first) / (last - first)
-    # The turns on the way are known well, and the rest of that of the pair is spread over them.
+    # The rotations in between are well known; the remaining rotation of the pair is spread evenly over them.
     start = Rotation.from_matrix(turned.rotation[images])
-    rest = (Rotation.from_matrix(rotation @ turned.rotation[first]) * start[-1].inv()).as_rotvec()
-    bundle.rotation[images] = (Rotation.from_rotvec(share[:, None] * rest) * start).as_matrix()
+    remaining = (Rotation.from_matrix(rotation @ turned.rotation[first]) * start[-1].inv()).as_rotvec()
+    bundle.rotation[images] = (Rotation.from_rotvec(share[:, None] * remaining) * start).as_matrix()
     bundle.centre[images] = share[:, None] * -(bundle.rotation[last].T @ translation[:, 0])
-    begun = Map(
+    initial = Map(
         tracks, focal_px, bundle, np.isin(np.arange(count), images), np.zeros(number, bool), np.arange(number) < known
     )
-    _add_points(begun, usual=0.2)
+    _add_points(initial, usual=0.2)
     for robust_px in (3.0, _ROBUST_PX):
-        _adjust(begun, images[1:], images, robust_px, rounds=25)
-    return begun
+        _adjust(initial, images[1:], images, robust_px, rounds=25)
+    return initial
 
 
-def _score(begun: Map) -> float:
-    """Inliers' share, lessened where the whole has little parallax."""
-    residual = begun.residuals_px()[begun.posed[begun.tracks.image]]
-    images = np.nonzero(begun.posed)[0]
-    path = float(np.linalg.norm(begun.bundle.centre[images[-1]] - begun.bundle.centre[images[0]]))
-    angle_px = begun.focal_px * path * float(np.median(begun.bundle.point[begun.pointed, 2]))
-    return float((residual < _INLIER_PX / 2).mean()) ** 2 * min(angle_px, 2 * _ENOUGH_PX)
+def _score(initial: Map) -> float:
+    """Return the score of an initial map, which grows with its inlier share and its parallax."""
+    residual = initial.residuals_px()[initial.posed[initial.tracks.image]]
+    images = np.nonzero(initial.posed)[0]
+    path = float(np.linalg.norm(initial.bundle.centre[images[-1]] - initial.bundle.centre[images[0]]))
+    angle_px = initial.focal_px * path * float(np.median(initial.bundle.point[initial.pointed, 2]))
+    return float((residual < _INLIER_PX / 2).mean()) ** 2 * min(angle_px, 2 * _AMPLE_PARALLAX_PX)
 
 
-def _extended(whole: Map, at: int, step: int) -> bool:
-    """Give the keyframe beside the last one a pose, if enough of its tracks agree on one."""
-    new, bundle, tracks = at + step, whole.bundle, whole.tracks
+def _extend(whole: Map, current: int, step: int) -> bool:
+    """Estimate the pose of the next keyframe; returns False if too few of its tracks agree on one."""
+    new, bundle, tracks = current + step, whole.bundle, whole.tracks
     rows = np.nonzero((tracks.image == new) & whole.pointed[tracks.track])[0]
-    if len(rows) < _FEWEST_SEEN:
+    if len(rows) < _FEWEST_POINTS:
         return False
-    before = at - step
-    going = whole.posed[before] if 0 <= before < len(whole.posed) else False
-    turn = bundle.rotation[at] @ bundle.rotation[before].T if going else np.eye(3)
-    bundle.rotation[new] = turn @ bundle.rotation[at]
-    bundle.centre[new] = 2 * bundle.centre[at] - bundle.centre[before] if going else bundle.centre[at]
-    alone = np.arange(len(whole.posed)) == new
+    previous = current - step
+    has_motion = whole.posed[previous] if 0 <= previous < len(whole.posed) else False
+    turn = bundle.rotation[current] @ bundle.rotation[previous].T if has_motion else np.eye(3)
+    bundle.rotation[new] = turn @ bundle.rotation[current]
+    bundle.centre[new] = 2 * bundle.centre[current] - bundle.centre[previous] if has_motion else bundle.centre[current]
+    only_new = np.arange(len(whole.posed)) == new
     for robust_px in (4.0, 1.0):
         adjust(
-            bundle, tracks.image[rows], tracks.track[rows], tracks.plane[rows], alone, whole.focal_px, robust_px, 15,
+            bundle, tracks.image[rows], tracks.track[rows], tracks.plane[rows], only_new, whole.focal_px, robust_px, 15,
             points_too=False,
         )  # fmt: skip
     whole.posed[new] = True
-    recent, around = (_posed(whole, new, step, count) for count in (_LOCAL, _BEHIND))
-    # Points whose depth nothing told so far learn it from this keyframe: they are no outliers before that.
-    _adjust(whole, recent, around, _LOOSE_PX, rounds=5)
+    recent, context = (_posed_before(whole, new, step, count) for count in (_LOCAL_KEYFRAMES, _CONTEXT_KEYFRAMES))
+    # This keyframe may be the first to determine the depth of a point, so outliers are rejected only afterwards.
+    _adjust(whole, recent, context, _LOOSE_PX, rounds=5)
     good = whole.residuals_px(rows) < _INLIER_PX
-    if good.sum() < _FEWEST_SEEN or good.mean() < _LEAST_SHARE:
+    if good.sum() < _FEWEST_POINTS or good.mean() < _LEAST_INLIER_SHARE:
         whole.posed[new] = False
         return False
     _split(whole, rows[~good], step)
     _add_points(whole, usual=float(np.median(bundle.point[tracks.track[rows], 2])))
-    _adjust(whole, recent, around, _ROBUST_PX, rounds=4)
+    _adjust(whole, recent, context, _ROBUST_PX, rounds=4)
     return True
 
 
-def _posed(whole: Map, last: int, step: int, count: int) -> Int64[np.ndarray, "images"]:
-    """Some keyframes with poses up to one of them."""
+def _posed_before(whole: Map, last: int, step: int, count: int) -> Int64[np.ndarray, "images"]:
+    """Return up to ``count`` keyframes with poses, from the last one backwards."""
     images = np.arange(last, last - step * count, -step)
     images = images[(images >= 0) & (images < len(whole.posed))]
     return images[whole.posed[images]]
 
 
 def _split(whole: Map, rows: Int64[np.ndarray, "rows"], step: int) -> None:
-    """Let tracks that have left their points be other tracks from these observations on."""
+    """Split tracks at these observations, where they no longer follow their points."""
     tracks = whole.tracks
     unused = np.nonzero(~whole.used)[0][: len(rows)]
     for row, fresh in zip(rows[: len(unused)], unused, strict=True):
@@ -183,14 +183,14 @@ def _split(whole: Map, rows: Int64[np.ndarray, "rows"], step: int) -> None:
 
 
 def _add_points(whole: Map, usual: float) -> None:
-    """Points for tracks that three keyframes with poses see, at the depth that suits them best."""
+    """Add points for tracks with observations in three posed keyframes, at the depth with the smallest error."""
     tracks, bundle = whole.tracks, whole.bundle
     wanted = whole.posed[tracks.image] & ~whole.pointed[tracks.track]
-    often = np.bincount(tracks.track[wanted], minlength=len(whole.pointed)) >= 3
-    rows = np.nonzero(wanted & often[tracks.track])[0]
+    long = np.bincount(tracks.track[wanted], minlength=len(whole.pointed)) >= 3
+    rows = np.nonzero(wanted & long[tracks.track])[0]
     if not len(rows):
         return
-    new, first, own = np.unique(tracks.track[rows], return_index=True, return_inverse=True)
+    new, first, row_point = np.unique(tracks.track[rows], return_index=True, return_inverse=True)
     seen = tracks.image[rows[first]]
     bundle.anchor[new] = bundle.centre[seen]
     bundle.axes[new] = bundle.rotation[seen].transpose(0, 2, 1)
@@ -198,34 +198,38 @@ def _add_points(whole: Map, usual: float) -> None:
     costs = []
     for inverse in usual * _DEPTHS:
         bundle.point[new, 2] = inverse
-        away = bundle.projected(tracks.image[rows], tracks.track[rows]) - tracks.plane[rows]
-        squared = np.minimum((whole.focal_px * away) ** 2, 1e4).sum(axis=1)
-        costs.append(np.bincount(own, np.log1p(squared)))
+        error = bundle.projected(tracks.image[rows], tracks.track[rows]) - tracks.plane[rows]
+        squared = np.minimum((whole.focal_px * error) ** 2, 1e4).sum(axis=1)
+        costs.append(np.bincount(row_point, np.log1p(squared)))
     bundle.point[new, 2] = usual * _DEPTHS[np.argmin(costs, axis=0)]
     whole.pointed[new] = True
 
 
 def _adjust_whole(whole: Map, rounds: int) -> None:
-    """All keyframes; of long recordings a stretch at a time, each held by the last third of the one before."""
+    """Adjust all keyframes; long recordings in stretches, each fixed at the last third of the previous one."""
     images = np.nonzero(whole.posed)[0]
     if len(images) <= _STRETCH:
         _adjust(whole, images[1:], images, _ROBUST_PX, rounds)
         return
-    for begin in range(0, len(images) - _STRETCH // 3, _STRETCH * 2 // 3):
-        stretch = images[begin : begin + _STRETCH]
-        _adjust(whole, stretch[_STRETCH // 3 if begin else 1 :], stretch, _ROBUST_PX, rounds)
+    for start_at in range(0, len(images) - _STRETCH // 3, _STRETCH * 2 // 3):
+        stretch = images[start_at : start_at + _STRETCH]
+        _adjust(whole, stretch[_STRETCH // 3 if start_at else 1 :], stretch, _ROBUST_PX, rounds)
 
 
 def _adjust(
-    whole: Map, moved: Int64[np.ndarray, "moved"], seeing: Int64[np.ndarray, "seeing"], robust_px: float, rounds: int
+    whole: Map,
+    free_images: Int64[np.ndarray, "free"],
+    observers: Int64[np.ndarray, "observers"],
+    robust_px: float,
+    rounds: int,
 ) -> None:
-    """Move some keyframes and all points that they see, by what these and others see."""
+    """Adjust some keyframes and the points observed in them, using the observations of further keyframes too."""
     tracks = whole.tracks
-    free = np.isin(np.arange(len(whole.posed)), moved)
-    held = np.isin(np.arange(len(whole.posed)), seeing)
+    free = np.isin(np.arange(len(whole.posed)), free_images)
+    used = np.isin(np.arange(len(whole.posed)), observers)
     visible = np.zeros(len(whole.pointed), bool)
     visible[tracks.track[free[tracks.image]]] = True
-    rows = np.nonzero(held[tracks.image] & (visible & whole.pointed)[tracks.track])[0]
+    rows = np.nonzero(used[tracks.image] & (visible & whole.pointed)[tracks.track])[0]
     adjust(
         whole.bundle,
         tracks.image[rows],
@@ -239,5 +243,5 @@ def _adjust(
 
 
 def halved(tracks: Tracks, which: int) -> Tracks:
-    """Every other track."""
+    """Return the tracks with even (0) or odd (1) numbers."""
     return tracks.select(tracks.track % 2 == which)

@@ -1,4 +1,4 @@
-"""What an estimate leaves on disk: the trajectory, its points, what it is worth; and the scene that it completes."""
+"""Output of an estimate: the trajectory, the points, the quality figures, and the completed scene."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from ebarf_ns.odometry.estimate import Estimate, estimated
 from ebarf_ns.odometry.settings import OdometrySettings
 from ebarf_ns.scene import Scene, read_scene, write_scene
 
-_BEYOND, _MARGIN = 0.02, 0.15
-"""Share of the points that are left out of the bounds at either end of an axis, and room around the others."""
+_OUTSIDE, _MARGIN = 0.02, 0.15
+"""Share of the points that are outside the bounds at each end of an axis, and margin around the others."""
 _FEWEST_FOR_BOUNDS = 50
 
 
 def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
-    """Give a scene folder whose trajectory.txt is still to come an estimated one, and bounds if it has none.
+    """Write an estimated trajectory to a scene folder without trajectory.txt, and bounds if it has none.
 
-    Raises :class:`~ebarf_ns.errors.OdometryError` where there is none to vouch for; the folder is left as it was.
+    Raises :class:`~ebarf_ns.errors.OdometryError` if there is no reliable one; the folder is then left unchanged.
     """
     scene = read_scene(folder, trajectory_to_come=True)
     if scene.trajectory.is_file():
         return
-    say(f"{scene.trajectory} is not there: estimating it from the events")
+    say(f"{scene.trajectory} does not exist, estimating it from the events")
     estimate = of_scene(scene, OdometrySettings())
     write_estimate(estimate, scene.trajectory, scene)
     for sentence in sentences(estimate):
@@ -38,7 +38,7 @@ def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
 
 
 def of_scene(scene: Scene, settings: OdometrySettings, progress: Callable[[str], None] = lambda step: None) -> Estimate:
-    """The estimate of a scene's recording, with the ratio of thresholds that the scene states or the events tell."""
+    """Estimate the trajectory of a scene, with the threshold ratio from the scene or else from its events."""
     file = RecordingFile(scene.events, scene.camera.width, scene.camera.height)
     threshold = scene.contrast_threshold
     if threshold is not None:
@@ -49,11 +49,13 @@ def of_scene(scene: Scene, settings: OdometrySettings, progress: Callable[[str],
 
 
 def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = None) -> None:
-    """Write the trajectory as TUM text, and beside it points.ply and odometry.json; give the scene that it completes
-    bounds where it has none."""
+    """Write the trajectory as TUM text, with points.ply and odometry.json beside it.
+
+    A ``completed`` scene without bounds also gets estimated bounds.
+    """
     quality = estimate.quality
     comments = [
-        f"estimated from events alone: {quality.kind}; its unit is arbitrary",
+        f"estimated from events alone: {quality.kind}, in an arbitrary unit",
         f"{quality.tracks} tracks, reprojection error {quality.reprojection_px:.2f} px, "
         f"{quality.span_share:.1%} of the recording's time",
     ]
@@ -74,44 +76,44 @@ def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = Non
 
 
 def sentences(estimate: Estimate) -> list[str]:
-    """For people: the verdict first."""
+    """Return the verdict and the quality of an estimate as lines for the terminal."""
     quality, t_us = estimate.quality, estimate.trajectory.t_us
     span = f"{int(t_us[0]) * 1e-6:.3f} to {int(t_us[-1]) * 1e-6:.3f} s, {quality.span_share:.1%} of the recording"
     first = {
         "six degrees of freedom": "verdict: positions and rotations, in an arbitrary unit",
-        "rotation only": "verdict: rotation only, positions are all zero: no parallax is seen",
+        "rotation only": "verdict: rotation only (no parallax); all positions are zero",
     }[quality.kind]
     found = [
         first,
         f"{quality.keyframes} keyframes from {span}",
-        f"{quality.tracks} tracks over {quality.view_share:.0%} of the view, {quality.inlier_share:.0%} of what is "
-        f"seen of them explained, reprojection error {quality.reprojection_px:.2f} px",
+        f"{quality.tracks} tracks over {quality.view_share:.0%} of the view, {quality.inlier_share:.0%} of their "
+        f"observations are inliers, reprojection error {quality.reprojection_px:.2f} px",
     ]
     rotation_deg = np.degrees(estimate.rotation_std_rad)
-    turns = f"{np.median(rotation_deg):.2f} (at most {rotation_deg.max():.2f}) degrees"
+    rotations = f"{np.median(rotation_deg):.2f} (at most {rotation_deg.max():.2f}) degrees"
     if quality.disagreement is not None:
         extent = np.ptp(estimate.trajectory.poses.position.numpy(), axis=0)
         share = estimate.position_std / max(float(np.linalg.norm(extent)), 1e-12)
         return [
             *found,
-            f"uncertainty of a keyframe, by estimates from either half of the tracks: {np.median(share):.1%} (at most "
-            f"{share.max():.1%}) of the path's extent, {turns}",
+            f"keyframe uncertainty, from the two halves of the tracks: {np.median(share):.1%} (at most "
+            f"{share.max():.1%}) of the path's extent, {rotations}",
         ]
     return [
         *found,
-        f"uncertainty of a keyframe: {turns}; rotation alone leaves {quality.parallax_px:.1f} px unexplained",
+        f"keyframe uncertainty: {rotations}; rotation alone leaves {quality.parallax_px:.1f} px unexplained",
     ]
 
 
 def estimated_bounds(estimate: Estimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Corners of a box around the cameras and nearly all points; None where these are few."""
+    """Return the corners of a box around the cameras and nearly all points, or None if there are few points."""
     if len(estimate.points) < _FEWEST_FOR_BOUNDS:
         return None
-    lower, upper = np.quantile(estimate.points, [_BEYOND, 1 - _BEYOND], axis=0)
+    lower, upper = np.quantile(estimate.points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
     cameras = estimate.trajectory.poses.position.numpy()
     lower, upper = np.minimum(lower, cameras.min(axis=0)), np.maximum(upper, cameras.max(axis=0))
-    room = _MARGIN * float((upper - lower).max())
-    return tuple((lower - room).tolist()), tuple((upper + room).tolist())
+    margin = _MARGIN * float((upper - lower).max())
+    return tuple((lower - margin).tolist()), tuple((upper + margin).tolist())
 
 
 def _ply(points: np.ndarray) -> str:

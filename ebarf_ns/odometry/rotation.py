@@ -1,4 +1,4 @@
-"""Rotation alone: the poses of a camera that only turns, as which every motion begins."""
+"""Estimation of rotations alone, from which mapping starts."""
 
 from __future__ import annotations
 
@@ -13,59 +13,59 @@ if TYPE_CHECKING:
 
     from ebarf_ns.odometry.tracks import Tracks
 
-_ROUNDS, _FEWEST, _GUESSES = 20, 6, 3
+_ROUNDS, _FEWEST_SHARED, _REWEIGHTINGS = 20, 6, 3
 _ROBUST_RAD = 0.005
 
 
 @dataclass(frozen=True)
 class Turned:
-    """Rotations, camera from world, of all keyframes, and how far each track strays from its direction."""
+    """Camera-from-world rotations of all keyframes, and the deviation of each track from its direction."""
 
     rotation: Float64[np.ndarray, "images 3 3"]
     track: Int64[np.ndarray, "tracks"]
     stray_rad: Float64[np.ndarray, "tracks"]
-    """Root mean square."""
+    """Root mean square deviation."""
 
 
 def turned(tracks: Tracks) -> Turned | None:
-    """The rotations that bring the bearings of each track together best; None where neighbours share too few."""
+    """Return the rotations that best align the bearings of each track; None if neighbours share too few tracks."""
     bearing = np.concatenate([tracks.plane, np.ones((len(tracks.plane), 1))], axis=1)
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
     number, track = np.unique(tracks.track, return_inverse=True)
-    begin = np.searchsorted(tracks.image, np.arange(int(tracks.image.max()) + 2))
-    rows = [slice(*pair) for pair in zip(begin[:-1], begin[1:], strict=True)]
-    point, known = np.zeros((len(number), 3)), np.zeros(len(number), bool)
+    start_row = np.searchsorted(tracks.image, np.arange(int(tracks.image.max()) + 2))
+    rows = [slice(*pair) for pair in zip(start_row[:-1], start_row[1:], strict=True)]
+    direction, known = np.zeros((len(number), 3)), np.zeros(len(number), bool)
     poses: list[np.ndarray] = []
     for observed in rows:
-        old = known[track[observed]]
-        if poses and old.sum() < _FEWEST:
+        is_known = known[track[observed]]
+        if poses and is_known.sum() < _FEWEST_SHARED:
             return None
         seen = track[observed]
-        pose = _rotation(point[seen[old]], bearing[observed][old], poses[-1]) if poses else np.eye(3)
+        pose = _aligned(direction[seen[is_known]], bearing[observed][is_known], poses[-1]) if poses else np.eye(3)
         poses.append(pose)
-        point[seen[~old]] = bearing[observed][~old] @ pose
+        direction[seen[~is_known]] = bearing[observed][~is_known] @ pose
         known[seen] = True
     rotation = np.stack(poses)
     for _ in range(_ROUNDS):
         world = np.einsum("nji,nj->ni", rotation[tracks.image], bearing)
-        weight = 1 / (1 + (np.linalg.norm(world - point[track], axis=1) / _ROBUST_RAD) ** 2)
-        point = np.stack([np.bincount(track, weight * axis) for axis in world.T], axis=1)
-        point /= np.linalg.norm(point, axis=1, keepdims=True)
+        weight = 1 / (1 + (np.linalg.norm(world - direction[track], axis=1) / _ROBUST_RAD) ** 2)
+        direction = np.stack([np.bincount(track, weight * axis) for axis in world.T], axis=1)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         rotation = np.stack(
-            [_rotation(point[track[own]], bearing[own], pose) for own, pose in zip(rows, rotation, strict=True)]
+            [_aligned(direction[track[own]], bearing[own], pose) for own, pose in zip(rows, rotation, strict=True)]
         )
     world = np.einsum("nji,nj->ni", rotation[tracks.image], bearing)
-    squared = ((world - point[track]) ** 2).sum(axis=1)
+    squared = ((world - direction[track]) ** 2).sum(axis=1)
     return Turned(rotation, number, np.sqrt(np.bincount(track, squared) / np.bincount(track)))
 
 
-def _rotation(
+def _aligned(
     world: Float64[np.ndarray, "n 3"], camera: Float64[np.ndarray, "n 3"], start: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "3 3"]:
-    """The rotation, camera from world, that aligns directions best, each weighted by how well a guess aligns it."""
+    """Return the camera-from-world rotation that best aligns directions, by iteratively reweighted least squares."""
     rotation = start
-    for _ in range(_GUESSES):
-        away = np.linalg.norm(world @ rotation.T - camera, axis=1)
-        scale = max(_ROBUST_RAD, 2 * float(np.median(away)))
-        rotation = Rotation.align_vectors(camera, world, weights=1 / (1 + (away / scale) ** 2))[0].as_matrix()
+    for _ in range(_REWEIGHTINGS):
+        error = np.linalg.norm(world @ rotation.T - camera, axis=1)
+        scale = max(_ROBUST_RAD, 2 * float(np.median(error)))
+        rotation = Rotation.align_vectors(camera, world, weights=1 / (1 + (error / scale) ** 2))[0].as_matrix()
     return rotation

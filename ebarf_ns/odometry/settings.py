@@ -1,13 +1,13 @@
-"""What can be chosen of an estimate; light, as every command imports it."""
+"""Settings of the odometry; without heavy imports, because every command imports this module."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class OdometrySettings:
-    """How an initial trajectory is estimated."""
+    """Settings of the estimation of an initial trajectory."""
 
     keyframe_px: float = 5.0
-    """How far things move between keyframes, usually."""
+    """Typical image motion between keyframes, in pixels."""
     memory_px: float = 4.5
-    """How far they move in the time constant of the event images."""
+    """Typical image motion during the time constant of the event images, in pixels."""

@@ -63,7 +63,7 @@ def test_a_data_set_for_nerfstudio_once(trained_run: Path, tmp_path: Path):
     finished = run_command(*words, tmp_path / "out")
     # After so short a training there may be no surface for the cloud: that is said.
     if finished.code:
-        assert "sharply enough" in finished.errors and not (tmp_path / "out").exists()
+        assert "sharp enough" in finished.errors and not (tmp_path / "out").exists()
         return
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert len(frames) == 6 and (tmp_path / "out" / frames[0]["file_path"]).is_file()

@@ -43,7 +43,7 @@ def test_the_report_says_what_held_out_events_say(tmp_path: Path):
     page = write_report(tmp_path, None).read_text()
     assert (
         "support the given trajectory<br>least certain is a tilt" in page
-        and "support the trajectory as it was given" in page
+        and "support the given trajectory, not the refined one" in page
     )
 
 

@@ -76,11 +76,11 @@ def test_another_size_shows_the_same_directions(camera: Camera):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (RenderSettings(format="png", start_us=0), "from 0 to 2000000 us was asked for"),
-        (RenderSettings(format="png", start_us=1_500_000, end_us=1_400_000), "times that increase"),
+        (RenderSettings(format="png", start_us=0), "the requested span is 0 to 2000000 us"),
+        (RenderSettings(format="png", start_us=1_500_000, end_us=1_400_000), "increasing times"),
         (RenderSettings(format="png", fps=0), "fps is 0"),
         (RenderSettings(format="png", slow=float("nan")), "slow is nan"),
-        (RenderSettings(format="png", fps=1e5, slow=1e3), "1 us or more between them"),
+        (RenderSettings(format="png", fps=1e5, slow=1e3), "at least 1 us apart"),
         (RenderSettings(format="png", height=0), "height is 0"),
         (RenderSettings(), "expected the name of an .mp4 file"),
     ],

@@ -71,7 +71,7 @@ def test_what_is_far_or_blurred_is_left_out(known: KnownRoom):
     near = points(known, replace(COARSE, farthest=2.0))
     reach = np.linalg.norm(near.position - np.array([-1.0, 0.0, 0.4]), axis=1)
     assert reach.max() < 3.2 < np.linalg.norm(points(known, COARSE).position - [-1.0, 0.0, 0.4], axis=1).max()
-    with pytest.raises(ExportError, match="sharply enough"):
+    with pytest.raises(ExportError, match="sharp enough"):
         points(FoggyRoom(known.scene), COARSE)
 
 

@@ -20,14 +20,14 @@ from tests.odometry.worlds import CAMERA, moving_squares, noise, recorded
 @pytest.mark.parametrize(
     ("recording", "why"),
     [
-        (noise(150_000, 1_000_000), "no motion|too few features|no trajectory"),
-        (noise(5_000, 20_000), "20.0 ms, too short a time"),
+        (noise(150_000, 1_000_000), "no motion|too few features|no reliable trajectory"),
+        (noise(5_000, 20_000), "20.0 ms, too short for parallax"),
         (noise(200, 1_000_000), "too few features|no motion"),
-        (moving_squares([(40, 60, 60, 0, 18)]), "of the view alone"),
-        (moving_squares([(30, 30, 60, 10, 18), (130, 90, -60, 0, 18)]), "of the view alone|no trajectory"),
+        (moving_squares([(40, 60, 60, 0, 18)]), "cover only"),
+        (moving_squares([(30, 30, 60, 10, 18), (130, 90, -60, 0, 18)]), "cover only|no reliable trajectory"),
         (
             moving_squares([(30, 30, 60, 0, 22), (130, 90, -60, 0, 22), (120, 25, -10, 50, 20), (40, 95, 20, -50, 20)]),
-            "of the view alone|no trajectory",
+            "cover only|no reliable trajectory",
         ),
     ],
     ids=["noise", "20 ms", "few events", "one object", "two objects", "four objects"],
