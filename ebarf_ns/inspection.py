@@ -227,7 +227,8 @@ def print_summary(summary: Summary, folder: Path) -> None:
 
 
 def _range(estimate: Estimate) -> str:
-    return f"{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g})"
+    value, low, high = (f"{one:.3g}" if one < 100 else f"{one:,.0f}" for one in vars(estimate).values())
+    return f"{value} ({low} to {high})"
 
 
 def _timing(sensor: SensorFacts) -> str:

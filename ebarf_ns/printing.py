@@ -1,7 +1,10 @@
 """Terminal output of facts and warnings about a file or folder."""
 
+import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -26,3 +29,8 @@ def print_facts(what: Path, suspicions: Sequence[str], facts: Sequence[tuple[str
 def print_line(console: Console, line: str, mark: str = "") -> None:
     """Print one line, wrapped between words on a terminal and left unwrapped elsewhere."""
     console.print(mark + escape(line), soft_wrap=not console.is_terminal)
+
+
+def print_json(content: dict[str, Any]) -> None:
+    """Print one JSON object on a line, for programs."""
+    sys.stdout.write(json.dumps(content) + "\n")

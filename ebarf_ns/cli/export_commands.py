@@ -1,5 +1,6 @@
 """The commands that export a finished run."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -153,9 +154,20 @@ def _ply(path: Path) -> Path:
 @contextmanager
 def _opened(run_folder: Path, activity: str) -> "Iterator[tuple[FinishedRun, Callable[[float], None]]]":
     """Yield the finished run, and a function that reports progress from 0 to 1."""
+    # Of torch and nerfstudio, about their own code.
+    warnings.filterwarnings("ignore", category=FutureWarning)
     from ebarf_ns.nerf.finished_run import open_run
 
     with Progress(transient=True, console=_stderr, disable=not _stderr.is_terminal) as shown:
         task = shown.add_task("opening the run", total=None)
         finished = open_run(run_folder)
-        yield finished, lambda share: shown.update(task, description=activity, completed=share, total=1.0)
+        announced = _stderr.is_terminal
+
+        def progress(share: float) -> None:
+            nonlocal announced
+            if not announced:
+                _stderr.print(f"{activity}: may take minutes", soft_wrap=True)
+                announced = True
+            shown.update(task, description=activity, completed=share, total=1.0)
+
+        yield finished, progress

@@ -1,9 +1,7 @@
 """The ``ebarf`` command: arguments in, one call, a message out."""
 
-import json
 import sys
-from dataclasses import asdict, dataclass, field
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,12 +13,13 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.cli.estimate_command import TrajectoryEstimate
 from ebarf_ns.cli.export_commands import Mesh, Points, Render, TrajectoryExport
+from ebarf_ns.cli.inspect_command import Inspect
 from ebarf_ns.cli.replay import Replay
-from ebarf_ns.errors import EbarfError, RecordingError, SceneError, did_you_mean, one_line_errors
+from ebarf_ns.errors import EbarfError, SceneError, one_line_errors
 from ebarf_ns.files import refuse_existing
 from ebarf_ns.formats.process import Format, ProcessSettings
-from ebarf_ns.formats.source import TimeUnit
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
+from ebarf_ns.printing import print_json
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
 
@@ -85,64 +84,6 @@ class Process:
 
 
 @dataclass
-class Inspect:
-    """What is in a scene folder, or in a recording of any format, and what looks wrong in it."""
-
-    scene: tyro.conf.Positional[Path]
-    """A scene folder, or a recording."""
-    picture: Path | None = None
-    """Of a recording: a PNG to make, with the events of some moments."""
-    part: str | None = None
-    """Of a recording: the group of an HDF5 file or the topic of a bag that has the events, where several have."""
-    event_time_unit: TimeUnit | None = None
-    """Of a recording: the unit of its times, where it does not say so."""
-    event_columns: str | None = None
-    """Of a recording: the order of columns without names, such as 'x y p t'."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
-
-    def run(self) -> None:
-        """Print the summary."""
-        from ebarf_ns.formats.recognise import recognised_folder
-
-        if not self.scene.exists():
-            raise SceneError(
-                f"{self.scene}: no such file or folder, expected a scene or a recording{did_you_mean(self.scene)}"
-            )
-        # A folder that is neither is taken for a scene, and told what it lacks.
-        if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
-            summary = self._recording()
-        else:
-            summary = self._scene()
-        if self.json:
-            _print_json(asdict(summary))
-
-    def _recording(self) -> Any:
-        from ebarf_ns.formats.raw_inspection import contact_sheet, inspect_recording, print_raw_summary
-        from ebarf_ns.formats.recognise import open_recording
-
-        if self.picture and self.picture.suffix.lower() != ".png":
-            raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
-        opened = partial(
-            open_recording, self.scene, part=self.part, time_unit=self.event_time_unit, columns=self.event_columns
-        )
-        summary = inspect_recording(opened)
-        if self.picture:
-            contact_sheet(opened, summary, self.picture)
-        if not self.json:
-            print_raw_summary(summary, self.scene)
-        return summary
-
-    def _scene(self) -> Any:
-        from ebarf_ns.inspection import inspect_scene, print_summary
-
-        summary = inspect_scene(self.scene)
-        if not self.json:
-            print_summary(summary, self.scene)
-        return summary
-
-
-@dataclass
 class TrajectoryCompare:
     """Errors of a trajectory against a reference, in any of the formats that ebarf process reads."""
 
@@ -158,7 +99,7 @@ class TrajectoryCompare:
         from ebarf_ns.evaluation.compare import compare_files
 
         comparison = compare_files(self.estimate, self.reference, self.known)
-        _print_json(comparison) if self.json else Console().print_json(data=comparison)
+        print_json(comparison) if self.json else Console().print_json(data=comparison)
 
 
 @dataclass
@@ -205,7 +146,7 @@ class Evaluate:
         if missing := lpips_note(evaluations[-1]):
             _stderr.print(missing, soft_wrap=True)
         if self.json:
-            _print_json({**evaluations[-1], "method": header.get("method"), "report": str(page)})
+            print_json({**evaluations[-1], "method": header.get("method"), "report": str(page)})
         else:
             Console().print_json(data=evaluations[-1])
             _stderr.print(f"report: {page}")
@@ -252,7 +193,7 @@ class Bench:
         measure = {"engine": self._engine, "recordings": self._recordings}.get(self.what, self._comparison)
         result, shown = measure()
         if self.json:
-            _print_json(result)
+            print_json(result)
         else:
             sys.stdout.write(shown + "\n")
 
@@ -295,10 +236,6 @@ class Bench:
 
 
 _stderr = Console(stderr=True)
-
-
-def _print_json(content: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(content) + "\n")
 
 
 def _with_config(words: list[str]) -> list[str]:

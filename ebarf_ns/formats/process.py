@@ -227,7 +227,7 @@ def _assemble(
         initial, said = _initial(settings.trajectory, settings.trajectory_format, groundtruth, span_us)
         notes += said
     if initial is None:
-        notes.append("no trajectory: ebarf trajectory estimate SCENE makes one from the events, as does training")
+        notes.append("no trajectory: training estimates one from the events, as does ebarf trajectory estimate")
     else:
         notes += doubts(source, span_us, initial, intake.time_offset_us)
         # With a time window or a given unit of event times, a mismatch is only a note.

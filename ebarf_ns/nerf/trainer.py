@@ -20,7 +20,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 from ebarf_ns.machine import use_threads
 from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf import optimizers
-from ebarf_ns.nerf.alignment import Alignment, align
+from ebarf_ns.nerf.alignment import NOT_ALIGNED, Alignment, align
 from ebarf_ns.nerf.averaging import Averaging
 from ebarf_ns.nerf.checkpoints import chosen_checkpoint, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.guard import GuardedOptimizers
@@ -126,7 +126,7 @@ class EbarfTrainer(Trainer):
                 torch.distributed.broadcast(found, 0)
             self.pipeline.datamanager.shift_clock(int(model.camera_optimizer.clock_offset_us))
         self.train_seconds = self._agreed(monotonic() - started)
-        CONSOLE.print(str(self.alignment or "no large error of the trajectory was looked for in this budget"))
+        CONSOLE.print(str(self.alignment or NOT_ALIGNED))
 
     def _has_budget_for_coarse_fields(self) -> bool:
         """Too few steps find nothing, and say so of any trajectory."""
@@ -254,6 +254,7 @@ class EbarfTrainer(Trainer):
             results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
             write_refined(self.pipeline, self.base_dir)
             if final:
+                CONSOLE.print("trained; the trajectory is now checked on held-out events")
                 write_moments(self.pipeline, self.base_dir / "moments.npz")
             found = self._support() if final else None
         self.results = {
@@ -274,8 +275,7 @@ class EbarfTrainer(Trainer):
         """What held-out events say of the refined trajectory, where there is the budget to ask them."""
         if not self._has_budget_for_coarse_fields():
             return None
-        model = self.pipeline.model
-        steps = model.config.camera_optimizer.align_steps // 2
+        model, steps = self.pipeline.model, self.pipeline.model.config.camera_optimizer.align_steps // 2
         return support(model, self.pipeline.datamanager, steps, self.config.machine.seed)
 
     @check_main_thread
