@@ -24,6 +24,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from ebarf_ns.geometry.so3 import quat_wxyz_conjugate, rotate
 from ebarf_ns.geometry.trajectory import Poses
 from ebarf_ns.nerf.pipeline import EbarfPipeline
+from ebarf_ns.nerf.viewer_lock import mend_viser
 from ebarf_ns.nerf.viewer_pictures import curves, half_window_us, recorded, rendered, side_by_side
 from ebarf_ns.nerf.viewer_scene import SCALE, DrawnScene, vertical_fov_rad
 
@@ -71,6 +72,7 @@ class ViewerPanel(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         """Set up the panel; nerfstudio calls this once its viewer is built, before the scene is."""
         super()._setup(viewer)
+        mend_viser()
         # The buttons that use these handles exist before the scene does.
         viewer.camera_handles = {}
         config = viewer.config
