@@ -7,7 +7,7 @@ import torch
 from ebarf_ns.evaluation.trajectory_error import trajectory_results
 from ebarf_ns.geometry.trajectory import corrected
 from ebarf_ns.geometry.trajectory_file import read_tum
-from ebarf_ns.nerf.alignment import align
+from ebarf_ns.nerf.alignment import align, roughness
 from ebarf_ns.nerf.support import support
 from ebarf_ns.nerf.trainer import EbarfTrainer
 from ebarf_ns.radiance.hash_grid import HashGrid
@@ -31,6 +31,13 @@ def test_without_enough_time_nothing_moves(tiny_scene: Path, tmp_path: Path):
     before = ready.pipeline.trajectory()
     assert align(ready.pipeline.model, ready.pipeline.datamanager, 1000, 0, most_seconds=1e-3) is None
     assert torch.equal(ready.pipeline.trajectory().poses.position, before.poses.position)
+
+
+def test_noise_is_rough_and_drift_is_smooth():
+    noise = torch.randn(60, 6, generator=torch.Generator().manual_seed(0))
+    course = torch.linspace(0, 9, 60)[:, None] * torch.linspace(0.5, 1.5, 6)
+    assert roughness(noise) == pytest.approx(1, abs=0.2) and roughness(course.sin()) < 0.05
+    assert roughness(torch.zeros(60, 6)) == 0
 
 
 def ready_trainer(folder: Path, errors: TrajectoryErrors, duration_s: float = 1.5) -> tuple[EbarfTrainer, Path]:
@@ -59,6 +66,16 @@ def test_a_large_drift_is_found_and_a_good_trajectory_left_alone(tmp_path: Path,
         assert after["rotation_deg"] < 0.4 * before["rotation_deg"], (before["rotation_deg"], after["rotation_deg"])
     else:
         assert torch.equal(ready.pipeline.trajectory().poses.position, given.poses.position)
+
+
+@pytest.mark.slow
+def test_noise_on_every_keyframe_is_left_to_training(tmp_path: Path):
+    ready, _ = ready_trainer(tmp_path, replace(NO_ERRORS, position_noise=0.12, rotation_noise_rad=0.12))
+    given = ready.pipeline.trajectory()
+    alignment = align(ready.pipeline.model, ready.pipeline.datamanager, 400, 0)
+    assert alignment and not alignment.taken and alignment.moved_px > 1.8, alignment
+    assert torch.equal(ready.pipeline.trajectory().poses.position, given.poses.position)
+    assert "noise" in str(alignment)
 
 
 @pytest.mark.slow
