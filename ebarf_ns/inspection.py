@@ -272,11 +272,11 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
         (
             "broken pixels",
             f"{summary.hot_pixels:,} hot, {summary.sensor.dead_pixels:,} dead; "
-            f"{summary.sensor.blank_share:.1%} of the others never fire, as nothing passes them",
+            f"{summary.sensor.blank_share:.1%} of the others never fired and saw no edge",
         ),
         (
             "distortion",
-            summary.distortion if summary.distortion == "none" else f"{summary.distortion}: undone once for each pixel",
+            summary.distortion,
         ),
         ("bounds", "given" if summary.bounded else "none: unbounded"),
         (

@@ -8,7 +8,9 @@ from typing import Annotated, Any
 import tyro
 import yaml
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 from ebarf_ns.benchmarks.settings import EngineBenchmark, RecordingsBenchmark
 from ebarf_ns.cli.estimate_command import TrajectoryEstimate
@@ -19,9 +21,11 @@ from ebarf_ns.errors import EbarfError, SceneError, one_line_errors
 from ebarf_ns.files import refuse_existing
 from ebarf_ns.formats.process import Format, ProcessSettings
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
-from ebarf_ns.printing import print_json
+from ebarf_ns.printing import print_json, print_line
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
+
+_ALIGNED_BY = {"sim3": "similarity (sim3)", "se3": "rigid motion (se3)", "orientation": "rotations"}
 
 
 @dataclass
@@ -85,10 +89,17 @@ class Process:
 
 @dataclass
 class TrajectoryCompare:
-    """Errors of a trajectory against a reference, in any of the formats that ebarf process reads."""
+    """Errors of a trajectory against a reference, in any of the formats that ebarf process reads.
 
-    estimate: tyro.conf.Positional[Path]
-    reference: tyro.conf.Positional[Path]
+    Positions are compared after Umeyama's alignment, with the scale free (sim3) and as it is (se3), and after an
+    alignment by the rotations, which is defined for motion along a line too. Rotations are compared after the best
+    rotation of the world; if the estimate is of another body on the same rig, after one of the body as well.
+    """
+
+    estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
+    """The trajectory to judge."""
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
+    """The trajectory that it is compared with."""
     known: tyro.conf.OmitArgPrefixes[TrajectoryFormat] = field(default_factory=TrajectoryFormat)
     """What the estimate's file does not say of itself."""
     json: bool = False
@@ -99,7 +110,27 @@ class TrajectoryCompare:
         from ebarf_ns.evaluation.compare import compare_files
 
         comparison = compare_files(self.estimate, self.reference, self.known)
-        print_json(comparison) if self.json else Console().print_json(data=comparison)
+        if self.json:
+            print_json(comparison)
+        else:
+            self._print(comparison)
+
+    def _print(self, comparison: dict[str, Any]) -> None:
+        """A table with the alignments in rows; positions are in the reference's unit."""
+        console = Console(highlight=False)
+        console.print(
+            f"[bold]{escape(str(self.estimate))}[/bold] against [bold]{escape(str(self.reference))}[/bold], "
+            f"{comparison['matched']} poses, root mean squares",
+            soft_wrap=True,
+        )
+        table = Table("aligned by", "position", "scale", "rotation", "less a fixed rotation of the body", box=None)
+        for alignment, words in _ALIGNED_BY.items():
+            if error := comparison[alignment]:
+                turns = (f"{error[name]:.3f}°" for name in ("rotation_deg", "rotation_deg_body"))
+                table.add_row(words, f"{error['ate_m']:.4g}", f"{error['scale']:.4g}", *turns)
+        console.print(table)
+        for note in comparison["notes"]:
+            print_line(console, note)
 
 
 @dataclass

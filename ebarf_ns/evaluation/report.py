@@ -184,14 +184,14 @@ def _support(last: Record) -> str:
 
 
 def _numbers(evaluations: list[Record], given: Record) -> str:
-    """What is measured in rows, evaluations in columns, the trajectory as given before them."""
-    rows = []
+    """What is measured in rows, evaluations in columns, the trajectory as given before them where it was judged."""
+    rows, judged = [], any(isinstance(given.get(name), int | float) for name in _NAMES)
     for name, (words, form) in _NAMES.items():
-        values = [record.get(name) for record in (given, *evaluations)]
-        if any(isinstance(value, int | float) for value in values[1:]):
+        values = [record.get(name) for record in ((given, *evaluations) if judged else evaluations)]
+        if any(isinstance(value, int | float) for value in values[judged:]):
             shown = ("" if value is None else form.format(value) for value in values)
             rows.append(f"<tr><td>{words}{''.join(f'<td>{value}' for value in shown)}")
-    heads = "".join(f"<th>{name}" for name in ("", "as given", *range(1, len(evaluations)), "last"))
+    heads = "".join(f"<th>{name}" for name in ("", *["as given"] * judged, *range(1, len(evaluations)), "last"))
     every = _text(json.dumps(evaluations[-1], indent=1))
     # Where the weights should be is this machine's affair.
     note = (lpips_note(evaluations[-1]) or "").split(" are not at ")[0]

@@ -41,7 +41,8 @@ def verdict(results: Mapping[str, Any], moved: tuple[float, float] | None = None
         mark = "doubtful" if mark == "good" else mark
         reasons.append("held-out events support the given trajectory, not the refined one")
     elif support.get("verdict") == "better":
-        reasons.append("held-out events support the refined trajectory, not the given one")
+        undecided = ", though its positions moved by less than is certain" if support.get("positions_undecided") else ""
+        reasons.append(f"held-out events support the refined trajectory, not the given one{undecided}")
     if results.get("inverted"):
         mark = "bad"
         reasons.append("renders are inverted: bright where the frames are dark")

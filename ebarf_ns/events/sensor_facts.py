@@ -62,7 +62,7 @@ class SensorFacts:
     dead_pixels: int
     """Pixels that cannot fire, recognised by their active neighbours."""
     blank_share: float
-    """Share of the other pixels that never fired because nothing passed them."""
+    """Share of the other pixels that never fired because no edge passed them."""
 
 
 _UNKNOWN_RATIO = Estimate(1.0, float(np.exp(-2 * _UNKNOWN_DEVIATION)), float(np.exp(2 * _UNKNOWN_DEVIATION)))

@@ -138,6 +138,11 @@ def _unpacked(source: Path) -> Iterator[Path]:
 def _ingredients(format: Format, source: Path, settings: ProcessSettings) -> Ingredients:
     if not source.exists():
         raise SceneError(f"{source}: no such file or folder, expected a recording{did_you_mean(source)}")
+    if format == "auto" and (source / "scene.json").is_file() and not settings.camera:
+        raise SceneError(
+            f"{source}: a scene folder already, train with: ebarf train {source}; to make another scene of its "
+            f"recording, give its calibration too: --camera {source}/scene.json"
+        )
     layout = _layout(format, source)
     if layout:
         if not source.is_dir():
@@ -267,10 +272,8 @@ def _assemble(
     contradicted = polarity_contradicted(polarity_correlations(scene))
     notes += [f"suspicious: {contradicted}"] if contradicted else []
     imported = "" if len(frames) == within else f", {len(frames)} imported"
-    notes.append(
-        f"{len(initial.t_us) if initial else 'no'} keyframes around the events, "
-        f"{within} of {seen} frames within their span{imported}"
-    )
+    of_frames = f"{within} of {seen} frames within their span{imported}" if seen else "no frames"
+    notes.append(f"{len(initial.t_us) if initial else 'no'} keyframes around the events, {of_frames}")
     return report.sentences() + notes
 
 

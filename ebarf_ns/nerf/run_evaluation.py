@@ -26,7 +26,12 @@ def write_refined(pipeline: EbarfPipeline, folder: Path) -> None:
 def record_evaluation(record: dict[str, Any], found: Support | None, folder: Path) -> None:
     """Add a record to the run's metrics and logs, with what held-out events say of the trajectory where asked."""
     if found:
-        record["support"] = {"verdict": found.verdict, "says": str(found), **asdict(found)}
+        record["support"] = {
+            "verdict": found.verdict,
+            "says": str(found),
+            "positions_undecided": found.positions_undecided,
+            **asdict(found),
+        }
     record_metrics(folder, record)
     numbers = {name: value for name, value in record.items() if isinstance(value, float)}
     writer.put_dict(name="Evaluation", scalar_dict=numbers, step=record["step"] - 1)

@@ -80,9 +80,15 @@ class Support:
             return "alike"
         return "better" if self.deviations > 0 else "worse"
 
+    @property
+    def positions_undecided(self) -> bool:
+        """Whether positions moved by less than one standard deviation of the weakest direction."""
+        return self.weakest is not None and self.shifted < self.weakest.shift
+
     def __str__(self) -> str:
         said = {
-            "better": "held-out events support the refined trajectory",
+            "better": "held-out events support the refined trajectory"
+            + (", its rotations at least" if self.positions_undecided else ""),
             "alike": "held-out events do not distinguish the refined trajectory from the given one",
             "worse": "held-out events support the given trajectory, which is in trajectory_initial.txt",
         }[self.verdict]
@@ -93,7 +99,7 @@ class Support:
         ]
         if self.weakest:
             lines.append(str(self.weakest))
-            if self.shifted < self.weakest.shift:
+            if self.positions_undecided:
                 lines.append(
                     f"positions moved by {self.shifted:.2g}, less than that: they may be no better than the given ones"
                 )

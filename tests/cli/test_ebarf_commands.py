@@ -109,6 +109,20 @@ def test_trajectory_compare_prints_one_object(tiny_scene: Path):
     assert errors["matched"] == 11 and errors["sim3"]["ate_m"] > 0 and errors["se3"]["rotation_deg"] > 0
 
 
+def test_trajectory_compare_prints_a_table_for_people(tiny_scene: Path):
+    output = run_ok("ebarf", "trajectory", "compare", tiny_scene / "trajectory.txt", tiny_scene / "groundtruth.txt")
+    assert "11 poses" in output and "similarity (sim3)" in output and "°" in output
+    assert "ape_full" not in output and "quaternions x y z w" in output
+
+
+def test_process_says_that_a_scene_is_one(tiny_scene: Path, tmp_path: Path):
+    finished = run_command("ebarf", "process", "auto", tiny_scene, "--output", tmp_path / "scene")
+    assert finished.code == 2 and finished.errors.count("\n") == 1 and not (tmp_path / "scene").exists()
+    assert "a scene folder already" in finished.errors and f"--camera {tiny_scene}/scene.json" in finished.errors
+    remade = ("--camera", tiny_scene / "scene.json", "--output", tmp_path / "scene")
+    assert "no frames" in run_command("ebarf", "process", "auto", tiny_scene, *remade).errors
+
+
 def test_trajectory_perturb_is_repeatable(tiny_scene: Path, tmp_path: Path):
     for name in ("a.txt", "b.txt"):
         run_ok("ebarf", "trajectory", "perturb", tiny_scene / "groundtruth.txt", tmp_path / name, "--seed=4")

@@ -101,6 +101,15 @@ def test_without_reference_and_frames_held_out_events_speak(tmp_path: Path):
     page = write_report(tmp_path, trajectories(tmp_path, reference=False)).read_text()
     assert "does not explain the recording" in page and "30% of the changes" in page
     assert "there is no reference" in page and "no frames to compare with" in page and "Errors over time" not in page
+    assert "as given" not in page
+
+
+def test_a_verdict_says_where_positions_are_undecided():
+    support = {"verdict": "better", "positions_undecided": True}
+    (reason,) = (one for one in verdict({"support": support}).reasons if "refined trajectory" in one)
+    assert "positions moved by less than is certain" in reason
+    (reason,) = (one for one in verdict({"support": {**support, "positions_undecided": False}}).reasons)
+    assert "positions" not in reason
 
 
 @pytest.mark.parametrize(
