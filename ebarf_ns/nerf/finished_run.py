@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import yaml
 
-from ebarf_ns.errors import EvaluationError
 from ebarf_ns.evaluation.report import read_metrics
 from ebarf_ns.export.subject import Seen
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.nerf.checkpoints import newest_whole, read_checkpoint
-from ebarf_ns.nerf.trainer import EbarfTrainerConfig
+from ebarf_ns.nerf.run_config import read_run_config
 from ebarf_ns.photometry.brightness import log_brightness
 from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.simulation.sensor import SensorModel
@@ -74,9 +72,9 @@ class FinishedRun:
 def open_run(folder: Path) -> FinishedRun:
     """Open a run's newest whole checkpoint, wherever the folder was moved.
 
-    Raises :class:`EvaluationError`, and what its scene and checkpoints raise.
+    No code in the folder is run. Raises :class:`EvaluationError`, and what its scene and checkpoints raise.
     """
-    config = _read_config(folder / "config.yml")
+    config = read_run_config(folder / "config.yml")
     checkpoint, _ = newest_whole(folder / "nerfstudio_models")
     if (folder / "scene" / "scene.json").is_file():
         config.pipeline.datamanager.dataparser.kept = folder / "scene"  # pyright: ignore[reportAttributeAccessIssue]
@@ -87,19 +85,6 @@ def open_run(folder: Path) -> FinishedRun:
     # Nothing is learned any more: a time constant of zero counts as no delay.
     pipeline.requires_grad_(False)
     return FinishedRun(pipeline, _sensor(pipeline, folder))
-
-
-def _read_config(path: Path) -> EbarfTrainerConfig:
-    try:
-        # As nerfstudio reads it: it names classes.
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except OSError as error:
-        raise EvaluationError(f"{path}: {error.strerror or error}; expected the folder of a training run") from None
-    except Exception as error:  # whatever the classes that a damaged file names raise
-        raise EvaluationError(f"{path}: cannot be read ({error}); expected the config.yml of a training run") from None
-    if not isinstance(config, EbarfTrainerConfig):
-        raise EvaluationError(f"{path}: holds a {type(config).__name__}, expected the configuration of an ebarf run")
-    return config
 
 
 def _sensor(pipeline: EbarfPipeline, folder: Path) -> SensorModel:

@@ -1,0 +1,108 @@
+"""The configuration of a run, read from its ``config.yml`` without running what the file says.
+
+Nerfstudio dumps configurations as YAML that names classes and has its loader call them, so that a stranger's file can
+run anything. Here only the classes and functions that this package's own configurations hold can be named, and none of
+them is called but enumerations and paths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
+from importlib import import_module
+from pathlib import Path, PosixPath, PurePath, WindowsPath
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from ebarf_ns.errors import EvaluationError
+from ebarf_ns.nerf.method import ebarf, ebarf_paper, enerf
+from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+# What may be imported to look a name up.
+_PACKAGES = ("ebarf_ns.", "nerfstudio.", "torch.optim.", "pathlib.")
+_TAG = "tag:yaml.org,2002:python/"
+
+
+def read_run_config(path: Path) -> EbarfTrainerConfig:
+    """Read the configuration of an ebarf run; raises :class:`EvaluationError`."""
+    try:
+        # A safe loader with fewer, not more powers than the tags suggest.
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except OSError as error:
+        raise EvaluationError(f"{path}: {error.strerror or error}; expected the folder of a training run") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        said = " ".join(str(error).split())
+        raise EvaluationError(f"{path}: cannot be read ({said}); expected the config.yml of a training run") from None
+    if not isinstance(config, EbarfTrainerConfig):
+        raise EvaluationError(f"{path}: holds a {type(config).__name__}, expected the configuration of an ebarf run")
+    return config
+
+
+class _Loader(yaml.SafeLoader):
+    """Knows plain values, tuples, paths, and what :func:`_known` names."""
+
+
+def _object(loader: _Loader, name: str, node: yaml.Node) -> Iterator[Any]:
+    made = object.__new__(_looked_up(name, node))
+    yield made
+    if not (is_dataclass(made) and isinstance(node, yaml.MappingNode)):
+        raise yaml.constructor.ConstructorError(None, None, f"{name} is no configuration", node.start_mark)
+    vars(made).update(loader.construct_mapping(node, deep=True))
+
+
+def _applied(loader: _Loader, name: str, node: yaml.Node) -> Any:
+    made = _looked_up(name, node)
+    if isinstance(node, yaml.SequenceNode):
+        values = loader.construct_sequence(node)
+        if issubclass(made, PurePath) and all(isinstance(value, str) for value in values):
+            return Path(*values)
+        if issubclass(made, Enum) and len(values) == 1 and values[0] in [one.value for one in made]:
+            return made(values[0])
+    raise yaml.constructor.ConstructorError(None, None, f"no value of {name}", node.start_mark)
+
+
+def _looked_up(name: str, node: yaml.Node) -> Any:
+    try:
+        if not name.startswith(_PACKAGES):
+            raise ImportError
+        module, _, attribute = name.rpartition(".")
+        found = getattr(import_module(module), attribute)
+        if not any(found is one for one in _known()):
+            raise ImportError
+    except (ImportError, AttributeError):
+        message = f"it names {name}, which no configuration of this package holds"
+        raise yaml.constructor.ConstructorError(None, None, message, node.start_mark) from None
+    return found
+
+
+@cache
+def _known() -> tuple[Any, ...]:
+    """The classes and functions in this package's configurations, and the paths."""
+    held = _held([method.config for method in (ebarf, ebarf_paper, enerf)])
+    return *dict.fromkeys(held), PosixPath, WindowsPath
+
+
+def _held(value: object) -> Iterator[Any]:
+    if isinstance(value, type) or callable(value):
+        yield value
+    elif isinstance(value, Enum):
+        yield type(value)
+    elif is_dataclass(value):
+        yield type(value)
+        yield from _held([getattr(value, field.name) for field in fields(value)])
+    elif isinstance(value, dict):
+        yield from _held(list(value.values()))
+    elif isinstance(value, list | tuple):
+        for one in value:
+            yield from _held(one)
+
+
+_Loader.add_constructor(f"{_TAG}tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+_Loader.add_multi_constructor(f"{_TAG}object:", _object)
+_Loader.add_multi_constructor(f"{_TAG}object/apply:", _applied)
+_Loader.add_multi_constructor(f"{_TAG}name:", lambda loader, name, node: _looked_up(name, node))
