@@ -45,9 +45,9 @@ def write_plain(content: dict[str, Any], path: Path) -> None:
         with whole_file(path) as temporary:
             torch.save(content, temporary)
     except (OSError, RuntimeError) as error:
-        # Torch wraps what the system says.
-        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
-        raise TrainingError(f"{path}: cannot be written ({said}); expected room on the disk") from None
+        # Torch's own error is of positions in its archive, whatever the system said.
+        said = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
+        raise TrainingError(f"{path}: cannot be written{said}; expected room on the disk") from None
 
 
 def read_plain(path: Path, what: str) -> dict[str, Any]:

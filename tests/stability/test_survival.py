@@ -138,13 +138,15 @@ def test_signals_at_random_moments_lose_nothing(
 
 
 FULL_DISK = """
-import json, os, sys
+import sys
 from pathlib import Path
+# A dependency may have left its own tests among the installed packages.
+sys.path.insert(0, "REPOSITORY")
 from tests.stability.test_survival import resumed, saving
 from tests.nerf.test_training import trainer
 made = resumed(saving(Path(sys.argv[1]), Path(sys.argv[2]), every=20))
 trainer(made).train()
-"""
+""".replace("REPOSITORY", str(REPOSITORY))
 
 
 def in_namespace(script: str, *words: object) -> subprocess.CompletedProcess[str]:
