@@ -114,7 +114,7 @@ def test_a_full_disk_leaves_what_was_there_and_is_said_in_one_line(tmp_path: Pat
     try:
         # A limit to files' sizes looks like a full disk to whoever writes.
         resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
-        with pytest.raises(TrainingError, match="cannot be written .*; expected room on the disk") as failed:
+        with pytest.raises(TrainingError, match="cannot be written.*; expected room on the disk") as failed:
             write_checkpoint(some_state(2), step_path(tmp_path, 2))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
