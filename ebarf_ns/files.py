@@ -15,24 +15,33 @@ from ebarf_ns.errors import EbarfError
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write to; it becomes ``path`` when the block ends without an exception."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    """Yield a temporary path to write to; it becomes ``path`` when the block ends without an exception.
+
+    A link stays, and what it leads to is replaced. Raises :class:`EbarfError` where ``path`` is a pipe or a device.
+    """
+    target = path.resolve()
+    if is_special(target):
+        raise EbarfError(f"{path}: a pipe or a device, expected a file to write")
+    temporary = None
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())
         temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-        synced(path.parent)
+        temporary.replace(target)
+        synced(target.parent)
     except OSError as error:
-        # A full disk does not say of itself what found it full.
-        error.filename = error.filename or str(path)
+        # A full disk does not say of itself what found it full, and nobody knows the temporary name.
+        if error.filename is None or Path(os.fsdecode(error.filename)).name.startswith(f".{path.stem}."):
+            error.filename, error.filename2 = str(path), None
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary:
+            temporary.unlink(missing_ok=True)
 
 
 def synced(folder: Path) -> None:

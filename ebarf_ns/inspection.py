@@ -21,7 +21,7 @@ from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.machine import free_threads
 from ebarf_ns.plan import Line, plan_for
 from ebarf_ns.printing import print_facts, print_line
-from ebarf_ns.scene import Scene, check_bounds, check_clocks, read_scene
+from ebarf_ns.scene import Scene, check_bounds, check_clocks, events_left_out, read_scene
 
 _FEW_EVENTS_PER_PIXEL = 5
 _FEW_PIXELS = 0.005
@@ -135,8 +135,8 @@ def _summarize(scene: Scene, trajectory: Trajectory) -> Summary:
 def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[str]:
     found = []
     outside = summary.events - summary.events_within_trajectory
-    if 0 < summary.events_within_trajectory and outside > 0.05 * summary.events:
-        found.append(f"{outside / summary.events:.0%} of the events lie outside the trajectory's span and are left out")
+    if summary.events_within_trajectory:
+        found += events_left_out(outside, summary.events)
     if not 0.35 < summary.brighter_share < 0.65:
         found.append(
             f"{summary.brighter_share:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?"

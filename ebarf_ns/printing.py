@@ -2,12 +2,14 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress, ProgressColumn
 from rich.table import Table
 
 
@@ -29,6 +31,18 @@ def print_facts(what: Path, suspicions: Sequence[str], facts: Sequence[tuple[str
 def print_line(console: Console, line: str, mark: str = "") -> None:
     """Print one line, wrapped between words on a terminal and left unwrapped elsewhere."""
     console.print(mark + escape(line), soft_wrap=not console.is_terminal)
+
+
+@contextmanager
+def progress_shown(console: Console, *columns: ProgressColumn) -> Iterator[Progress]:
+    """A progress display that leaves nothing behind; where the console is no terminal, nothing is shown."""
+    progress = Progress(*columns, transient=True, console=console)
+    if not console.is_terminal:
+        # Older rich leaves an empty line there, even if it is told to show nothing.
+        yield progress
+        return
+    with progress:
+        yield progress
 
 
 def print_json(content: dict[str, Any]) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "ebarf-scene", 1
 # A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
+_LARGE_SHARE = 0.05
 _LONGEST_SPAN_RATIO = 100
 _LONGEST_REFRACTORY_US = 1_000_000
 _LONGEST_TIME_CONSTANT_US = 1_000_000
@@ -159,6 +160,12 @@ def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajector
             f"{scene.trajectory}: spans {last_us - first_us} us with {among} keyframes among the events, which span "
             f"{end_us - start_us} us; {expected}"
         )
+
+
+def events_left_out(outside: int, events: int) -> list[str]:
+    """Say which share of the events lies outside the trajectory's span, if it is large."""
+    large = outside > _LARGE_SHARE * events
+    return [f"{outside / events:.0%} of the events lie outside the trajectory's span and are left out"] if large else []
 
 
 def write_scene(scene: Scene) -> None:

@@ -36,6 +36,7 @@ from ebarf_ns.benchmarks.engine_step import (
     renderer,
 )
 from ebarf_ns.benchmarks.figures import Figure, machine, shown
+from ebarf_ns.benchmarks.roofline import roofline
 from ebarf_ns.benchmarks.settings import PARTS, EngineBenchmark, Part
 from ebarf_ns.events.batches import DrawAhead, HeldoutBlocks, batch_random
 from ebarf_ns.events.indexing import index_pairs
@@ -126,6 +127,13 @@ class _Engine:
             ahead, batches = DrawAhead(step.draw, ahead=1 if device() == "cpu" else 4), count()
             drawn = median_seconds(lambda take=ahead.batch, of=batches: take(next(of)), 20 * self._repetitions)
             yield Figure(f"sampler's speed over the step's, {pairs:,} pairs", seconds / drawn, "times", at_least=5)
+
+    def roofline(self) -> Iterator[Figure]:
+        """The field beside the limits of this machine's arithmetic and memory."""
+        quick = self.quick
+        yield from roofline(
+            64 if quick else 1024, 128 if quick else 2048, 1 << (16 if quick else 26), self._repetitions
+        )
 
     def scaling(self) -> Iterator[Figure]:
         """Scaling exponent of the step time in each workload parameter: 1 is linear, 0 is constant."""

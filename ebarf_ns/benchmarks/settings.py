@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 # Parts that fill the memory come last.
-Part = Literal["hash_grid", "step", "nerfacto", "frame", "simulator", "training", "scaling", "index"]
+Part = Literal["hash_grid", "roofline", "step", "nerfacto", "frame", "simulator", "training", "scaling", "index"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 

@@ -1,5 +1,6 @@
 """The first word of the ``ebarf`` command: what commands there are is said without the imports that they need."""
 
+import signal
 import sys
 from difflib import get_close_matches
 from importlib.metadata import version
@@ -48,9 +49,14 @@ def entrypoint() -> None:
 
         train(words[1:])
     elif words[0] in COMMANDS:
-        from ebarf_ns.cli.main import entrypoint as run
+        # As Ctrl-C does, it lets what is half written be removed.
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        try:
+            from ebarf_ns.cli.main import entrypoint as run
 
-        run()
+            run()
+        except KeyboardInterrupt:
+            raise SystemExit(128 + signal.SIGINT) from None
     else:
         near = get_close_matches(words[0], COMMANDS, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ebarf_ns.errors import SceneError
 from ebarf_ns.odometry.settings import OdometrySettings
+from ebarf_ns.printing import progress_shown
 
 if TYPE_CHECKING:
     from ebarf_ns.odometry.estimate import Estimate
@@ -45,7 +46,7 @@ class TrajectoryEstimate:
         columns = TextColumn("{task.description}"), SpinnerColumn(), TimeElapsedColumn()
         with (
             tempfile.TemporaryDirectory() as folder,
-            Progress(*columns, transient=True, console=stderr, disable=not stderr.is_terminal) as progress,
+            progress_shown(stderr, *columns) as progress,
         ):
             task = progress.add_task("reading", total=None)
             say = lambda step: progress.update(task, description=step)  # noqa: E731

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
 
 from ebarf_ns.errors import ExportError, RecordingError
 from ebarf_ns.export.settings import RenderSettings, SurfaceSettings, TrajectoryFileFormat
 from ebarf_ns.files import refuse_existing
+from ebarf_ns.printing import progress_shown
 
 if TYPE_CHECKING:
     from ebarf_ns.nerf.finished_run import FinishedRun
@@ -158,7 +158,7 @@ def _opened(run_folder: Path, activity: str) -> "Iterator[tuple[FinishedRun, Cal
     warnings.filterwarnings("ignore", category=FutureWarning)
     from ebarf_ns.nerf.finished_run import open_run
 
-    with Progress(transient=True, console=_stderr, disable=not _stderr.is_terminal) as shown:
+    with progress_shown(_stderr) as shown:
         task = shown.add_task("opening the run", total=None)
         finished = open_run(run_folder)
         announced = _stderr.is_terminal

@@ -21,7 +21,7 @@ from ebarf_ns.errors import EbarfError, SceneError, one_line_errors
 from ebarf_ns.files import refuse_existing
 from ebarf_ns.formats.process import Format, ProcessSettings
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat
-from ebarf_ns.printing import print_json, print_line
+from ebarf_ns.printing import print_json, print_line, progress_shown
 from ebarf_ns.simulation.simulate import Simulation
 from ebarf_ns.simulation.trajectory_errors import TrajectoryErrors, perturb
 
@@ -42,7 +42,7 @@ class Simulate:
         from ebarf_ns.simulation.simulate import simulate
 
         refuse_existing(self.output)
-        with Progress(transient=True, console=_stderr) as progress:
+        with progress_shown(_stderr) as progress:
             task = progress.add_task("simulating", total=1.0)
             simulate(self.settings, self.output, lambda fraction: progress.update(task, completed=fraction))
         _stderr.print(f"simulated scene in {self.output}; look at it with: ebarf inspect {self.output}")
@@ -74,7 +74,7 @@ class Process:
         if source is None:
             raise SceneError("no recording named, expected: ebarf process FORMAT SOURCE --output SCENE")
         columns = TextColumn("{task.description}"), SpinnerColumn(), TimeElapsedColumn()
-        with Progress(*columns, transient=True, console=_stderr, disable=not _stderr.is_terminal) as progress:
+        with progress_shown(_stderr, *columns) as progress:
             task = progress.add_task("reading", total=None)
             said = process(
                 self.format,
@@ -147,6 +147,8 @@ class TrajectoryPerturb:
         """Write the perturbed trajectory."""
         from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
 
+        if self.output.resolve() == self.source.resolve():
+            raise SceneError(f"{self.output}: the trajectory that is read, expected another file to write")
         perturbed = perturb(read_tum(self.source), self.errors, self.seed)
         write_tum(self.output, perturbed)
         _stderr.print(f"{len(perturbed.t_us)} perturbed poses in {self.output}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.files import opened_npz
-from ebarf_ns.formats.camera_entry import INTRINSICS, Size, camera_of, matrix_of
+from ebarf_ns.formats.camera_entry import FISHEYE, INTRINSICS, Size, camera_of, matrix_of
 from ebarf_ns.formats.named_values import KNOWN_LAYOUTS, Entry, numbers_of, parsed, plain, shown, text_of
 from ebarf_ns.geometry.cameras import Camera
 
@@ -27,6 +27,8 @@ class Calibrated:
     camera: Camera
     rig_from_camera: np.ndarray | None = None
     """4x4; the rig frame is the IMU or another reference of the file."""
+    notes: tuple[str, ...] = ()
+    """What the file leaves open and is assumed."""
 
 
 def read_calibration(path: Path, which: str | None = None, sensor_size: Size | None = None) -> Calibrated:
@@ -48,6 +50,22 @@ def read_calibration(path: Path, which: str | None = None, sensor_size: Size | N
 def read_cameras(path: Path, sensor_size: Size | None = None) -> dict[str, Calibrated]:
     """Read all cameras of a calibration file by name, see :func:`read_calibration`; raises :class:`SceneError`."""
     return {name: read() for name, read in _cameras(path, sensor_size).items()}
+
+
+def camera_notes(camera: Camera) -> list[str]:
+    """One line that shows a camera, and a suspicion if its principal point is outside the middle half of the image."""
+    named = f"{len(camera.distortion)} coefficients" if camera.distortion else "no distortion"
+    notes = [
+        f"camera: {camera.model} {camera.width} x {camera.height}, f {camera.fx:g} {camera.fy:g}, "
+        f"c {camera.cx:g} {camera.cy:g}, {named}"
+    ]
+    shares = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    if not all(0.25 <= share <= 0.75 for share in shares):
+        notes.append(
+            f"suspicious: the principal point {camera.cx:g} {camera.cy:g} is far from the middle of {camera.width} x "
+            f"{camera.height} pixels: in pixels, cx before cy, and of this size of image?"
+        )
+    return notes
 
 
 def _cameras(path: Path, size: Size | None) -> dict[str, Callable[[], Calibrated]]:
@@ -82,7 +100,12 @@ def _of_content(path: Path, content: Any, size: Size | None) -> dict[str, Callab
         top = top.inner("intrinsics")
     if _is_camera(top.content):
         return {"camera": _reader(top, size)}
-    entries = {str(name): top.inner(name) for name, one in top.content.items() if _is_camera(one)}
+    # DV states whether the lens is a fisheye beside the camera, not within it.
+    fisheye = top.key(FISHEYE)
+    above = {} if fisheye is None else {fisheye: top.content[fisheye]}
+    entries = {
+        str(name): Entry(path, top.name(name), {**above, **one}) for name, one in top.content.items() if _is_camera(one)
+    }
     if not entries:
         keys = shown(", ".join(map(str, list(top.content)[:20])))
         raise SceneError(f"{path}: holds {keys if top.content else 'nothing'}, expected {KNOWN_LAYOUTS}")
@@ -96,10 +119,15 @@ def _is_camera(content: Any) -> bool:
     return any(plain(key) in keys for key in (*INTRINSICS, "camera_model", "distortion_model", "model_type", "fx"))
 
 
+def _calibrated(entry: Entry, size: Size | None, pose: np.ndarray | None) -> Calibrated:
+    camera, notes = camera_of(entry, size)
+    return Calibrated(camera, pose, tuple(notes))
+
+
 def _reader(entry: Entry, size: Size | None) -> Callable[[], Calibrated]:
     def read() -> Calibrated:
         body = entry.key(("T_BS",))
-        return Calibrated(camera_of(entry, size), None if body is None else matrix_of(entry, body))
+        return _calibrated(entry, size, None if body is None else matrix_of(entry, body))
 
     return read
 
@@ -126,12 +154,12 @@ def _basalt(top: Entry) -> dict[str, Callable[[], Calibrated]]:
 def _of_basalt(top: Entry, number: int, lens: Any, size: Any, pose: Any) -> Callable[[], Calibrated]:
     def read() -> Calibrated:
         entry = Entry(top.path, f"{top.name('intrinsics')}[{number}]", lens)
-        camera = camera_of(Entry(top.path, entry.place, {**entry.content, "resolution": size}), None)
+        camera = _calibrated(Entry(top.path, entry.place, {**entry.content, "resolution": size}), None, None)
         placed = Entry(top.path, f"{top.name('T_imu_cam')}[{number}]", pose)
         values = {one: placed.number((one,)) for one in ("px", "py", "pz", *_TURN)}
         if not any(values[one] for one in _TURN):
             raise placed.wrong("qw", "a quaternion that is not 0")
-        return Calibrated(camera, pose_matrix(values))
+        return replace(camera, rig_from_camera=pose_matrix(values))
 
     return read
 
@@ -152,18 +180,17 @@ def _chained(entries: Mapping[str, Entry], name: str, size: Size | None) -> Call
 
     def read() -> Calibrated:
         entry = entries[name]
-        camera = camera_of(entry, size)
         if all("T_cam_imu" in one.content for one in entries.values()):
-            return Calibrated(camera, np.linalg.inv(matrix_of(entry, "T_cam_imu")))
+            return _calibrated(entry, size, np.linalg.inv(matrix_of(entry, "T_cam_imu")))
         if entry.content.get("T_BS") is not None:
-            return Calibrated(camera, matrix_of(entry, "T_BS"))
+            return _calibrated(entry, size, matrix_of(entry, "T_BS"))
         pose = np.eye(4)
         before = list(entries)[1 : list(entries).index(name) + 1]
         for one in (entries[other] for other in before):
             if one.content.get("T_cn_cnm1") is None:
-                return Calibrated(camera)
+                return _calibrated(entry, size, None)
             pose = pose @ np.linalg.inv(matrix_of(one, "T_cn_cnm1"))
-        return Calibrated(camera, pose if len(entries) > 1 else None)
+        return _calibrated(entry, size, pose if len(entries) > 1 else None)
 
     return read
 
@@ -209,7 +236,7 @@ def _value(node: Any) -> Any:
 def _of_m3ed(entry: Entry) -> Callable[[], Calibrated]:
     def read() -> Calibrated:
         pose = entry.key(("T_to_prophesee_left",))
-        return Calibrated(camera_of(entry, None), None if pose is None else matrix_of(entry, pose))
+        return _calibrated(entry, None, None if pose is None else matrix_of(entry, pose))
 
     return read
 
@@ -220,4 +247,4 @@ def _robust_e_nerf(path: Path) -> Calibrated:
             content = {name: file[name].tolist() for name in file.files}
     except (OSError, ValueError):
         raise SceneError(f"{path}: cannot be read as an npz file, expected Robust e-NeRF's calibration") from None
-    return Calibrated(camera_of(Entry(path, "", content), None))
+    return _calibrated(Entry(path, "", content), None, None)

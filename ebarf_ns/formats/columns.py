@@ -39,6 +39,7 @@ _EXACT = 2.0**53  # larger floats are not exact integers
 _LARGEST_SENSOR = 8192
 _FEW_ROWS = 8
 _POLARITIES = ({0, 1}, {-1, 1})
+_CHECKED = "times never decrease, polarities are 0 or -1, and 1; that x is before y is assumed"
 
 
 def named(fields: Iterable[str]) -> dict[str, str] | None:
@@ -55,6 +56,19 @@ def named(fields: Iterable[str]) -> dict[str, str] | None:
 def unit_of(name: str) -> TimeUnit | None:
     """The unit in a column name, as in ``t_ns``."""
     return UNITS.get(_unit_in(name.lower()))
+
+
+def stated_unit(text: str) -> TimeUnit | None:
+    """The unit in a remark such as ``time in ms`` or ``timestamps [ns]``."""
+    of = r"(?:\W*\b(?:is|are|units?|in)\b\W*|\s*[\[(:=]\s*)+"
+    found = re.search(rf"\b(?:t|ts|times?|timestamps?)\b{of}([a-z\u00b5\u03bc]+)\b", text.lower())
+    return UNITS.get(found[1]) if found else None
+
+
+def worded_unit(text: object) -> TimeUnit | None:
+    """The unit that an attribute begins with, as in ``microseconds since 2024``."""
+    text = text.decode(errors="replace") if isinstance(text, bytes) else str(text)
+    return UNITS.get(re.split(r"\W", text.strip().lower())[0])
 
 
 def _unit_in(name: str) -> str:
@@ -90,12 +104,12 @@ def inferred_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usu
     if len(columns[0]) < _FEW_ROWS:
         return usual, "the usual order: too few events to check it"
     if usual_fits and certain in ([], [usual]):
-        return usual, "the usual order, which the values fit: times never decrease, polarities are 0 or -1, and 1"
+        return usual, f"the usual order, which the values fit: {_CHECKED}"
     fitting = certain or [order for order, fit in readings.items() if fit]
     if usual_fits and usual not in fitting:
         fitting.append(usual)
     if len(fitting) == 1:
-        return fitting[0], "inferred from the values: times never decrease, polarities are 0 or -1, and 1"
+        return fitting[0], f"inferred from the values: {_CHECKED}"
     if fitting:
         both = " and as ".join(repr(spaced(order)) for order in fitting)
         raise RecordingError(f"{path}: columns without names read as {both}, expected --event-columns with the order")
@@ -103,6 +117,17 @@ def inferred_order(path: Path, columns: Sequence[Num[np.ndarray, "events"]], usu
     if usual not in unsorted and len(unsorted) == 1:
         return unsorted[0], "inferred from the values, although times decrease"
     return usual, "the usual order, although the values do not fit it"
+
+
+def contradicting_order(columns: Sequence[Num[np.ndarray, "events"]], order: str) -> str:
+    """Another order that the values fit, where they do not fit ``order``; empty if there is none.
+
+    Which of two columns is x, the values cannot tell.
+    """
+    plain = order if order.index("x") < order.index("y") else order.translate(str.maketrans("xy", "yx"))
+    if len(columns[0]) < _FEW_ROWS or _fit(columns, plain) or _fits_unsorted(columns, plain):
+        return ""
+    return next((other for other in _orders() if _fit(columns, other) == 2), "")
 
 
 def look_like_events(columns: Sequence[Num[np.ndarray, "events"]]) -> bool:

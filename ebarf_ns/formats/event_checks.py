@@ -38,7 +38,8 @@ def check_values(source: Source, piece: Piece, width: int, height: int) -> None:
     if wide < height and high < width:
         other = source.columns.translate(str.maketrans("xy", "yx"))
         swapped = f"; x reaches {wide} and y {high}: are they swapped?"
-        swapped += f" Then use --event-columns '{' '.join(other)}'" if other else ""
+        cure = f"use --event-columns '{' '.join(other)}'" if other else "exchange width and height in the calibration"
+        swapped += f" Then {cure}"
     for name, column, wrong, expected in (
         ("x", x, (x < 0) | (x >= width), f"0 to {width - 1}, the sensor width{swapped}"),
         ("y", y, (y < 0) | (y >= height), f"0 to {height - 1}, the sensor height{swapped}"),

@@ -16,14 +16,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ebarf_ns.compiled import njit
+from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.recording import Recording, joined, write_recording
 from ebarf_ns.formats.event_checks import MAX_TIME_US, check_order, check_polarity, check_values, late, unwrapped
-from ebarf_ns.formats.source import Source
+from ebarf_ns.formats.source import Piece, Source
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int64
 
 _RUN = np.dtype([("t_us", "<i8"), ("x", "<u2"), ("y", "<u2"), ("polarity", "i1")])
+_COARSE_US, _FEW_EVENTS = 100, 8
 _MERGED_AT_ONCE, _SAMPLE_EVERY = 1 << 20, 1 << 10
 
 
@@ -39,6 +41,8 @@ class Intake:
     """Drop pixels with more events than the median of the active ones plus this many median deviations."""
     refractory_us: int = 0
     """Drop events closer than this to the last kept event of their pixel."""
+    one_based: bool = False
+    """Subtract 1 from x and y, for a source that counts pixels from 1, as MATLAB does."""
     flip_polarity: bool = False
     """Swap ON and OFF, for a source with inverted polarity."""
     flip_x: bool = False
@@ -54,6 +58,43 @@ class Intake:
     """Drop events before this time, on the recording's clock after the offset."""
     end_us: int | None = None
     """Drop events after this time."""
+
+
+@dataclass
+class Extent:
+    """Extremes of the pixels, and the common step of the times, while events are read."""
+
+    left: int = 1 << 62
+    top: int = 1 << 62
+    right: int = -1
+    bottom: int = -1
+    first_us: int | None = None
+    last_us: int = 0
+    step_us: int = 1_000_000
+    """The largest power of ten of which all times are multiples, after the first one."""
+    events: int = 0
+
+    def add(self, piece: Piece) -> None:
+        """Take the events of a piece into account."""
+        self.left, self.right = min(self.left, int(piece.x.min())), max(self.right, int(piece.x.max()))
+        self.top, self.bottom = min(self.top, int(piece.y.min())), max(self.bottom, int(piece.y.max()))
+        self.first_us = int(piece.t_us[0]) if self.first_us is None else self.first_us
+        self.last_us, self.events = int(piece.t_us[-1]), self.events + len(piece)
+        while self.step_us >= _COARSE_US and ((piece.t_us - self.first_us) % self.step_us).any():
+            self.step_us //= 10
+
+    def swapped(self, sensor_size: tuple[int, int]) -> bool:
+        """Whether the events fit the sensor with x and y swapped."""
+        return self.right < sensor_size[1] and self.bottom < sensor_size[0]
+
+    def doubts(self, sensor_size: tuple[int, int] | None) -> list[str]:
+        """Notes on coarse times, and on pixels that may be counted from 1."""
+        found = []
+        if self.events >= _FEW_EVENTS and self.step_us >= _COARSE_US and self.last_us != self.first_us:
+            found.append(f"times are multiples of {self.step_us:,} us: rounded, or in another unit?")
+        if sensor_size and (self.left, self.top, self.right + 1, self.bottom + 1) == (1, 1, *sensor_size):
+            found.append("no event has an x or y of 0: are pixels counted from 1? Then use --one-based")
+        return found
 
 
 @dataclass
@@ -148,7 +189,13 @@ def _checked(
     """Pieces of valid events in file order, within the time window."""
     width, height = sensor_size
     wrapped_us, before_us, lowest, highest = 0, None, 1, 0
+    extent = Extent()
     for piece in source.pieces:
+        extent.add(piece)
+        if intake.one_based:
+            piece = _from_zero(source, piece)  # noqa: PLW2901
+        else:
+            _check_counted_from_zero(source, piece, extent, sensor_size)
         check_values(source, piece, width, height)
         lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
         check_polarity(source, piece, lowest, highest)
@@ -166,6 +213,34 @@ def _checked(
         y = (height - 1 - y).astype(np.uint16) if intake.flip_y else y
         t_us = t_us + intake.time_offset_us if intake.time_offset_us else t_us
         yield _windowed(Recording(x, y, t_us, polarity), intake, report)
+    report.notes += tuple(extent.doubts(None if intake.one_based else sensor_size))
+
+
+def _from_zero(source: Source, piece: Piece) -> Piece:
+    """Events with pixels counted from 0 instead of 1."""
+    for name, column in (("x", piece.x), ("y", piece.y)):
+        if column.min() < 1:
+            raise RecordingError(
+                f"{source.path}: {name} of {piece.place(int(column.argmin()))} is {column.min()}, expected 1 or more "
+                "with --one-based"
+            )
+    return replace(piece, x=piece.x - 1, y=piece.y - 1)
+
+
+def _check_counted_from_zero(source: Source, piece: Piece, extent: Extent, sensor_size: tuple[int, int]) -> None:
+    """Raise :class:`RecordingError` for pixels just beyond a sensor whose first row and column have no events."""
+    beyond = extent.right == sensor_size[0] or extent.bottom == sensor_size[1]
+    if not beyond or extent.right > sensor_size[0] or extent.bottom > sensor_size[1] or extent.swapped(sensor_size):
+        return
+    if extent.left >= 1 and extent.top >= 1:
+        names = ("x", piece.x, "width"), ("y", piece.y, "height")
+        name, column, side = names[extent.right < sensor_size[0]]
+        largest = int(column.max())
+        raise RecordingError(
+            f"{source.path}: {name} of {piece.place(int(column.argmax()))} is {largest}, expected 0 to {largest - 1}, "
+            f"the sensor {side}; x is from {extent.left} to {extent.right} and y from {extent.top} to {extent.bottom}: "
+            "counted from 1? Then use --one-based"
+        )
 
 
 def _windowed(events: Recording, intake: Intake, report: IntakeReport) -> Recording:

@@ -20,12 +20,12 @@ from ebarf_ns.errors import SceneError, did_you_mean
 from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.evaluation.polarity import polarity_contradicted, polarity_correlations
 from ebarf_ns.files import read_picture, whole_folder, write_picture
-from ebarf_ns.formats.calibration import read_calibration
+from ebarf_ns.formats.calibration import Size, camera_notes, read_calibration
 from ebarf_ns.formats.intake import Intake, hot_pixels, take_in
 from ebarf_ns.formats.layouts import LAYOUTS, FrameFile, Given, Ingredients, Layout, recognised_layout
 from ebarf_ns.formats.recognise import RecordingFormat, open_recording, recognised, recognised_folder
 from ebarf_ns.formats.source import Source, TimeUnit
-from ebarf_ns.formats.trajectory_beside_events import apart, clipped, doubts
+from ebarf_ns.formats.trajectory_beside_events import apart, clipped, doubts, outside
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.cameras import Camera, Crop, cropped
 from ebarf_ns.geometry.so3 import rotate
@@ -36,22 +36,9 @@ from ebarf_ns.scene import ContrastThreshold, Frame, Scene, write_scene
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 Format = Literal[
-    "auto",
-    "ecd",
-    "tumvie",
-    "eds",
-    "esim",
-    "robust-e-nerf",
-    "hdf5",
-    "aedat4",
-    "bag",
-    "raw",
-    "dat",
-    "npz",
-    "npy",
-    "mat",
+    "auto", "ecd", "tumvie", "eds", "esim", "robust-e-nerf", "hdf5", "aedat4", "bag", "raw", "dat", "npz", "npy", "mat",
     "text",
-]
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -205,7 +192,7 @@ def _assemble(
     ingredients: Ingredients, settings: ProcessSettings, folder: Path, progress: Callable[[int], None]
 ) -> list[str]:
     source = ingredients.open_events()
-    camera, notes = _camera(ingredients, settings, source.sensor_size), list(ingredients.notes)
+    camera, notes = _camera(ingredients, settings, source.sensor_size)
     size, intake = (camera.width, camera.height), settings.events
     whole = camera
     if intake.crop:
@@ -239,6 +226,7 @@ def _assemble(
         intended = intake.start_us is not None or intake.end_us is not None or settings.event_time_unit is not None
         notes += apart(initial, span_us, settings.trajectory or source.path, intended)
         initial = clipped(initial, span_us, settings.trajectory or source.path)
+        notes += outside(folder / "events.h5", initial)
         notes += [f"trajectory.txt: {sentence}" for sentence in torn(initial)]
         write_tum(folder / "trajectory.txt", initial)
     if groundtruth is not None:
@@ -277,10 +265,11 @@ def _assemble(
     return report.sentences() + notes
 
 
-def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int, int] | None) -> Camera:
-    camera = ingredients.camera
+def _camera(ingredients: Ingredients, settings: ProcessSettings, said: Size | None) -> tuple[Camera, list[str]]:
+    camera, notes = ingredients.camera, list(ingredients.notes)
     if settings.camera and camera is None:
-        camera = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said).camera
+        calibrated = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said)
+        camera, notes = calibrated.camera, [*notes, *calibrated.notes]
     if camera is None:
         raise SceneError(
             "no calibration with the recording, expected --camera with a file that has one: of kalibr, ROS, OpenCV, "
@@ -291,7 +280,7 @@ def _camera(ingredients: Ingredients, settings: ProcessSettings, said: tuple[int
             f"the recording gives a sensor size of {said[0]} x {said[1]} pixels, the calibration {camera.width} x "
             f"{camera.height}; expected both to be of one camera"
         )
-    return camera
+    return camera, camera_notes(camera) + notes
 
 
 def _initial(

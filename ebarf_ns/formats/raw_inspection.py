@@ -8,7 +8,8 @@ import numpy as np
 
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.files import whole_file, write_picture
-from ebarf_ns.formats.intake import far_busier
+from ebarf_ns.formats.event_checks import check_polarity
+from ebarf_ns.formats.intake import Extent, far_busier
 from ebarf_ns.formats.source import Piece, Source
 from ebarf_ns.printing import print_facts
 
@@ -50,7 +51,11 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
     slots: dict[int, int] = {}
     events = brighter = late = moments = 0
     first_us, last_us, before_us = None, 0, None
+    lowest, highest, extent = 1, 0, Extent()
     for piece in source.pieces:
+        extent.add(piece)
+        lowest, highest = min(lowest, int(piece.polarity.min())), max(highest, int(piece.polarity.max()))
+        check_polarity(source, piece, lowest, highest)
         counts = _count(source.path, counts, piece)
         slot, number = np.unique(piece.t_us // _SLOT_US, return_counts=True)
         for one, many in zip(slot.tolist(), number.tolist(), strict=True):
@@ -84,6 +89,7 @@ def inspect_recording(open_events: Callable[[], Source], parts: int = 40) -> Raw
         suspicions=[
             *_suspicions(source, counts, brighter / events, late),
             *_doubts(source, events, moments, last_us - first_us),
+            *extent.doubts(said or (width, height)),
         ],
     )
 

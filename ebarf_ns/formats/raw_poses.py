@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -61,6 +62,8 @@ class RawPoses:
     places: tuple[str, ...] = ()
     """Location of each pose for messages, such as the line of a text file."""
     notes: tuple[str, ...] = ()
+    unclear: str = ""
+    """What the file says of the order of its quaternions without giving it."""
 
     def place(self, path: Path, pose: int) -> str:
         """Location of a pose for messages."""
@@ -124,13 +127,24 @@ def times_beside(path: Path, count: int, names: list[str] | None, known: Traject
     if known.pose_times is None:
         raise TrajectoryError(f"{path}: has no times, expected --pose-times with a line for each of its {count} poses")
     times = _listed(known.pose_times)
-    if names is not None and all(Path(name).name in times for name in names):
+    if names is not None and named_beside(names, known):
         return [times[Path(name).name] for name in names]
     if len(times) != count:
         raise TrajectoryError(
             f"{known.pose_times}: {len(times)} times, expected one for each of the {count} poses of {path}"
         )
     return list(times.values())
+
+
+def named_beside(names: list[str], known: TrajectoryFormat) -> bool:
+    """Whether the ``pose_times`` file gives the times by these names."""
+    times = _listed(known.pose_times) if known.pose_times else {}
+    return all(Path(name).name in times for name in names)
+
+
+def by_number(name: str) -> list[str | int]:
+    """Key that sorts names in order of the numbers within them: 2 before 10."""
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def _listed(path: Path) -> dict[str, Decimal]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -17,6 +18,16 @@ _MAGIC: dict[bytes, RecordingFormat] = {
     b"\x89MCAP0\r\n": "bag", b"PK\x03\x04": "npz", b"\x93NUMPY": "npy",
     b"MATLAB 5.0 MAT-file": "mat", b"MATLAB 7.3 MAT-file": "hdf5",
 }  # fmt: skip
+_OTHER = {
+    b"\x1f\x8b": "compressed by gzip, expected the file within, as gunzip unpacks it",
+    b"BZh": "compressed by bzip2, expected the file within, as bunzip2 unpacks it",
+    b"\xfd7zXZ": "compressed by xz, expected the file within, as unxz unpacks it",
+    b"\xff\xfe": "text in UTF-16, expected it in UTF-8", b"\xfe\xff": "text in UTF-16, expected it in UTF-8",
+    b"#!AER-DAT1": "AEDAT 1, expected AEDAT 4, or text of t x y p",
+    b"#!AER-DAT2": "AEDAT 2, as jAER writes it, expected AEDAT 4, or text of t x y p",
+    b"#!AER-DAT3": "AEDAT 3, as cAER writes it, expected AEDAT 4, or text of t x y p",
+}  # fmt: skip
+_ROWS_BELOW_COMMENTS = re.compile(rb"(?:%[^\n]*\n)+[ \t]*[-+\d][-+\d.eE \t,;]+\r?\n")
 _BEGINNING = 4096
 
 
@@ -94,7 +105,10 @@ def recognised(path: Path) -> RecordingFormat:
     for magic, found in _MAGIC.items():
         if beginning.startswith(magic):
             return found
-    if beginning.startswith(b"%"):
+    for magic, kind in _OTHER.items():
+        if beginning.startswith(magic):
+            raise RecordingError(f"{path}: {kind}")
+    if beginning.startswith(b"%") and not _ROWS_BELOW_COMMENTS.match(beginning):
         header = beginning.split(b"\n% end")[0].lower()
         return "raw" if b"\n% evt " in b"\n" + header or b"% format evt" in header else "dat"
     if beginning and b"\0" not in beginning:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from pathlib import Path
+from typing import Any
 
+import h5py
 import torch
 
 from ebarf_ns.errors import RecordingError, TrajectoryError
 from ebarf_ns.formats.source import DECIMALS, Source, TimeUnit
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, within_span
+from ebarf_ns.scene import events_left_out
 
 # A trajectory this many times longer than its recording, with fewer than two poses in it, has another time unit.
 _LONGEST_SPAN_RATIO = 100
@@ -60,6 +64,17 @@ def clipped(trajectory: Trajectory, span_us: tuple[int, int], path: Path) -> Tra
             f"{span_us[1]} us; expected at least 2 poses around the events, on the same clock"
         )
     return clipped
+
+
+def outside(events: Path, trajectory: Trajectory) -> list[str]:
+    """Note on the share of a scene's events before the first pose and after the last one, if it is large."""
+    with h5py.File(events, "r") as file:
+        t_us: Any = file["events/t"]
+        offset_us: Any = file["t_offset"]
+        first_us, last_us = (trajectory.t_us[[0, -1]] - int(offset_us[()])).tolist()
+        first, last = bisect_left(t_us, first_us), bisect_right(t_us, last_us)
+        found = events_left_out(len(t_us) - (last - first), len(t_us))
+    return [f"suspicious: {sentence}" for sentence in found]
 
 
 def apart(trajectory: Trajectory, span_us: tuple[int, int], path: Path, intended: bool) -> list[str]:

@@ -10,7 +10,7 @@ import struct
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -27,8 +27,10 @@ from ebarf_ns.formats.raw_poses import (
     TimeUnit,
     TrajectoryFormat,
     Transform,
+    by_number,
     check_lengths,
     moving,
+    named_beside,
     rotations,
     times_beside,
 )
@@ -55,6 +57,13 @@ _AXES: dict[Axes, np.ndarray] = {
     "llff": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
 }
 
+_OF_ROBUST_E_NERF = ("T_wc_timestamp", "T_wc_position", "T_wc_orientation")
+_READ = "poses as text in UTF-8, npy, npz (Robust e-NeRF), h5 (M3ED) or a COLMAP model"
+_KINDS = {
+    b"\xff\xfe": "text in UTF-16", b"\xfe\xff": "text in UTF-16", b"MATLAB": "a MATLAB file", b"#ROSBAG": "a ROS bag",
+    b"\x1f\x8b": "compressed with gzip", b"PK\x03\x04": "a zip or npz file", b"\x89HDF": "an HDF5 file",
+}  # fmt: skip
+
 
 def read_trajectory(
     path: Path, known: TrajectoryFormat = NOTHING_KNOWN, span_us: tuple[int, int] | None = None
@@ -78,6 +87,10 @@ def trajectory_of(
     quaternion, doubtful = known.quaternion or raw.quaternion, False
     if not raw.order_told and quaternion is None:
         quaternion, doubtful = "xyzw", order_is_doubtful(path, raw, known, span_us)
+    if doubtful and raw.unclear:
+        raise TrajectoryError(
+            f"{path}: {raw.unclear}, expected --quaternion, or a line with the names qx, qy, qz, qw in their order"
+        )
     if doubtful:
         raise TrajectoryError(
             f"{path}: times in {unit} with a point and no line of names are how DEVO and DEIO write quaternions as "
@@ -91,7 +104,7 @@ def trajectory_of(
     for before, after in pairwise(order.tolist()):
         if t_us[before] == t_us[after]:
             raise TrajectoryError(
-                f"{raw.place(path, after)}: times {raw.times[before]} and {raw.times[after]} in {unit} are in one "
+                f"{raw.place(path, after)}: times {raw.times[before]:f} and {raw.times[after]:f} in {unit} are in one "
                 "microsecond, expected a microsecond or more between poses"
             )
     columns = "" if raw.rotation.ndim == 3 else f", quaternions {' '.join(quaternion or '')}"
@@ -109,10 +122,12 @@ def trajectory_of(
 def order_is_doubtful(
     path: Path, raw: RawPoses, known: TrajectoryFormat, span_us: tuple[int, int] | None = None
 ) -> bool:
-    """Whether the quaternion order is ambiguous: microseconds written as floats, without column names, are typical of
-    one family of odometry."""
-    if raw.order_told or known.quaternion or not raw.pointed:
+    """Whether the quaternion order is ambiguous: names of columns or comments that do not give it, or microseconds
+    written as floats, without either, which are typical of one family of odometry."""
+    if raw.order_told or known.quaternion or not (raw.pointed or raw.unclear):
         return False
+    if raw.unclear:
+        return True
     return (known.pose_time_unit or raw.time_unit or recognised_unit(path, raw.times, span_us)) == "us"
 
 
@@ -129,7 +144,7 @@ def _check_numbers(path: Path, raw: RawPoses) -> None:
         if (first := seen.setdefault(time, k)) != k:
             where = "" if first == k - 1 else f", as in {raw.place(path, first).removeprefix(f'{path}:').strip()}"
             where = where.replace("as in ", "as in line ") if raw.places else where
-            raise TrajectoryError(f"{raw.place(path, k)}: time {time} again{where}, expected times that increase")
+            raise TrajectoryError(f"{raw.place(path, k)}: time {time:f} again{where}, expected times that increase")
     if raw.rotation.ndim == 2:
         check_lengths(raw.rotation, [raw.place(path, k) for k in range(len(raw.times))])
 
@@ -172,16 +187,35 @@ def read_raw(path: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> RawPoses:
         if path.suffix == ".bin":
             return _colmap(path, _colmap_binary(path), known)
         lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError, ValueError, EOFError, struct.error, KeyError) as error:
+    except UnicodeDecodeError:
+        raise TrajectoryError(f"{path}: {_kind(path)}, expected {_READ}") from None
+    except (OSError, ValueError, EOFError, struct.error, KeyError) as error:
         reason = getattr(error, "strerror", None) or error
+        if path.suffix in (".h5", ".hdf5"):
+            reason = "not a whole HDF5 file" if path.is_file() else "no such file"
         raise TrajectoryError(f"{path}: cannot be read ({reason}){did_you_mean(path)}") from None
+    if lines and lines[0].lstrip().startswith(("{", "<")):
+        raise TrajectoryError(f"{path}: begins with {lines[0].lstrip()[:20]!r}, as JSON or XML does, expected {_READ}")
     if path.name == "images.txt":
         return _colmap(path, _colmap_text(path, lines), known)
     return read_text(path, lines, known)
 
 
+def _kind(path: Path) -> str:
+    """What a file that is not text is, by its first bytes."""
+    with path.open("rb") as file:
+        begin = file.read(10)
+    return next((kind for mark, kind in _KINDS.items() if begin.startswith(mark)), "not text in UTF-8")
+
+
 def _robust_e_nerf(path: Path) -> RawPoses:
     with opened_npz(path) as file:
+        missing = [name for name in _OF_ROBUST_E_NERF if name not in file.files]
+        if missing:
+            raise TrajectoryError(
+                f"{path}: holds {', '.join(file.files[:8]) or 'nothing'}, expected {', '.join(_OF_ROBUST_E_NERF)} as "
+                "Robust e-NeRF writes them"
+            )
         times = [Decimal(int(t)) for t in file["T_wc_timestamp"]]
         position, rotation = file["T_wc_position"].astype(float), file["T_wc_orientation"].astype(float)
     return RawPoses("Robust e-NeRF npz", times, position, rotation, "xyzw", time_unit="ns")
@@ -190,7 +224,12 @@ def _robust_e_nerf(path: Path) -> RawPoses:
 def _m3ed(path: Path) -> RawPoses:
     """M3ED (Chaney et al. 2023): ``Cn_T_C0`` maps points from the first event camera, the world frame, to the n-th."""
     with h5py.File(path, "r") as file:
-        matrices, times = np.asarray(file["Cn_T_C0"], float), np.asarray(file["ts"])
+        found: list[Any] = [file.get(name) for name in ("Cn_T_C0", "ts")]
+        if not all(isinstance(one, h5py.Dataset) for one in found):
+            raise TrajectoryError(
+                f"{path}: holds {', '.join(list(file)[:8]) or 'nothing'}, expected Cn_T_C0 and ts as M3ED writes them"
+            )
+        matrices, times = np.asarray(found[0], float), np.asarray(found[1])
     if matrices.shape != (len(times), 4, 4):
         raise TrajectoryError(f"{path}: Cn_T_C0 is of shape {matrices.shape}, expected ({len(times)}, 4, 4)")
     rotation = rotations(path, matrices[:, :3, :3])
@@ -200,7 +239,12 @@ def _m3ed(path: Path) -> RawPoses:
 
 def _npy(path: Path, known: TrajectoryFormat) -> RawPoses:
     """LLFF's table, or flat or stacked matrices."""
-    table = np.load(path).astype(float)
+    table = np.load(path)
+    if table.dtype.kind not in "iuf":
+        raise TrajectoryError(
+            f"{path}: an array of {', '.join(table.dtype.names or [str(table.dtype)])}, expected numbers"
+        )
+    table = table.astype(float)
     shape, count = table.shape, len(table) if table.ndim else 0
     if shape[1:] == (3, 5):
         table, shape = table.reshape(-1, 15), (count, 15)
@@ -226,10 +270,14 @@ Images = list[tuple[str, list[float]]]
 def _colmap(path: Path, images: Images, known: TrajectoryFormat) -> RawPoses:
     if not images:
         raise TrajectoryError(f"{path}: holds no image, expected a COLMAP model with some")
-    images = sorted(images)
+    images = sorted(images, key=lambda image: by_number(image[0]))
     numbers = np.array([pose for _, pose in images])
-    times = times_beside(path, len(images), [name for name, _ in images], known)
-    return RawPoses("COLMAP model", times, numbers[:, 4:], numbers[:, :4], "wxyz", "world-to-camera")
+    names = [name for name, _ in images]
+    times = times_beside(path, len(images), names, known)
+    notes = ()
+    if not named_beside(names, known):
+        notes = (f"{path.name}: times without names are given to the images from {names[0]} to {names[-1]} in order",)
+    return RawPoses("COLMAP model", times, numbers[:, 4:], numbers[:, :4], "wxyz", "world-to-camera", notes=notes)
 
 
 def _colmap_text(path: Path, lines: list[str]) -> Images:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,14 @@ from ebarf_ns.files import is_special, synced, whole_file
 
 FORMAT = 1
 _KEPT = 2
+_NAME = re.compile(r"step-\d+\.ckpt")
+# What the system says of a file that it does not give, whatever is in it.
+_NOT_GIVEN = {errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE, errno.ETIMEDOUT, errno.ENOMEM}
+_PLAIN = (str, int, float, bool, type(None))
+
+
+class UnopenedCheckpointError(TrainingError):
+    """A checkpoint that may be good, but cannot be read here: an older one is no substitute."""
 
 
 def write_checkpoint(state: dict[str, Any], path: Path) -> None:
@@ -33,10 +43,15 @@ def write_checkpoint(state: dict[str, Any], path: Path) -> None:
     write_plain(state, beside)
     beside.replace(path)
     synced(path.parent)
-    there = sorted(path.parent.glob("step-*.ckpt"))
+    there = checkpoints_in(path.parent)
     at = there.index(path)
     for other in (*there[: max(at + 1 - _KEPT, 0)], *there[at + 1 :]):
         other.unlink()
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """A run's checkpoints, by their steps; not what else a user may keep beside them."""
+    return sorted(path for path in folder.glob("step-*.ckpt") if _NAME.fullmatch(path.name) and path.is_file())
 
 
 def write_plain(content: dict[str, Any], path: Path) -> None:
@@ -56,12 +71,33 @@ def read_plain(path: Path, what: str) -> dict[str, Any]:
     if is_special(path):
         raise TrainingError(f"{path}: a pipe or a device, expected a run's {what}")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        return {**content}
+        content = {**torch.load(path, map_location="cpu", weights_only=True)}
     except FileNotFoundError:
         raise TrainingError(f"{path}: is no file, expected a run's {what}") from None
     except Exception as error:  # whatever damaged bytes make the unpickler raise
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in _NOT_GIVEN):
+            said = getattr(error, "strerror", None) or "not enough memory"
+            raise UnopenedCheckpointError(f"{path}: cannot be read ({said}), expected a run's {what}") from None
         raise TrainingError(f"{path}: is damaged, or no {what} ({type(error).__name__})") from None
+    if name := _not_plain(content):
+        raise TrainingError(f"{path}: holds more than tensors and plain values, in {name}; expected a run's {what}")
+    if not isinstance(made := content.get("format", 0), int):
+        raise TrainingError(f"{path}: is of format {made!r:.40}, expected a number")
+    return content
+
+
+def _not_plain(state: Any, name: str = "") -> str:
+    """The name of what is no plain value, or a tensor that is larger than what is stored of it; empty if all are."""
+    if isinstance(state, Tensor):
+        dense = state.layout == torch.strided and state.device.type == "cpu"
+        stored = dense and state.numel() * state.element_size() <= state.untyped_storage().nbytes()
+        return "" if stored else name or "it"
+    if isinstance(state, _PLAIN):
+        return ""
+    items = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else None
+    if items is None:
+        return name or "it"
+    return next((found for key, one in items if (found := _not_plain(one, f"{name}.{key}".lstrip(".")))), "")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -73,7 +109,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(pipeline := state.get("pipeline"), dict) or not isinstance(state.get("step"), int):
         raise TrainingError(f"{path}: lacks step or pipeline, expected a run's checkpoint")
     if (made := state.get("format", 0)) > FORMAT:
-        raise TrainingError(f"{path}: is of format {made}, expected at most {FORMAT}: a newer ebarf_ns made it")
+        raise UnopenedCheckpointError(
+            f"{path}: is of format {made}, expected at most {FORMAT}: a newer ebarf_ns made it"
+        )
     stored = state.pop("checksum", None)
     if stored is not None and stored != checksum(state):
         raise TrainingError(f"{path}: is damaged: its checksum is not that of its content")
@@ -102,12 +140,14 @@ def chosen_checkpoint(config: Any) -> tuple[Path | None, list[TrainingError]]:
 def newest_whole(folder: Path) -> tuple[Path, list[TrainingError]]:
     """The newest checkpoint of a folder that can be read, and what is wrong with newer ones.
 
-    Raises :class:`TrainingError` where there is none.
+    Raises :class:`TrainingError` where there is none, or where a newer one may be good, but cannot be read here.
     """
     wrong: list[TrainingError] = []
-    for path in sorted(folder.glob("step-*.ckpt"), reverse=True):
+    for path in reversed(checkpoints_in(folder)):
         try:
             read_checkpoint(path)
+        except UnopenedCheckpointError:
+            raise
         except TrainingError as error:
             wrong.append(error)
         else:
@@ -124,7 +164,7 @@ def unsealed(pipeline: dict[str, Tensor], what: str) -> dict[str, Tensor]:
     """A pipeline's state without its checksum, verified; raises :class:`TrainingError` with ``what`` it is of."""
     state = dict(pipeline)
     stored = state.pop("checksum", None)
-    if stored is not None and int(stored) != checksum(state):
+    if stored is not None and not (isinstance(stored, Tensor) and stored.tolist() == checksum(state)):
         raise TrainingError(f"{what}: is damaged: its checksum is not that of its content; expected a whole checkpoint")
     if name := not_finite(state):
         raise TrainingError(f"{what}: holds values that are not finite, in {name}; expected a checkpoint of before")

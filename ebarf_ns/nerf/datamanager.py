@@ -15,7 +15,6 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils import comms
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from ebarf_ns.errors import RecordingError, one_line_errors
@@ -27,6 +26,7 @@ from ebarf_ns.events.sensor_facts import SensorFacts, identify
 from ebarf_ns.events.timing import clock_step_us, flicker_hz
 from ebarf_ns.geometry.trajectory import Trajectory
 from ebarf_ns.nerf.dataparser import EbarfDataParserConfig
+from ebarf_ns.nerf.terminal import say
 from ebarf_ns.nerf.views import EventDataset, SpiralStart
 from ebarf_ns.scene import Scene, check_clocks
 
@@ -103,14 +103,14 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
         if self.test_mode == "val":
             events, pairs = len(self.index.events), int(self.index.count(np.array(1)))
-            CONSOLE.print(f"{events:,} events, {pairs:,} consecutive pairs")
+            say(f"{events:,} events, {pairs:,} consecutive pairs")
             total, _, _ = self._recording.span()
             if events < total:
-                CONSOLE.print(f"left out {total - events:,} events: doubled, or outside the trajectory's span")
+                say(f"left out {total - events:,} events: doubled, or outside the trajectory's span")
             if self.hot_pixels_left_out:
-                CONSOLE.print(f"left out {self.hot_pixels_left_out:,} hot pixels, 3 times busier than their neighbours")
+                say(f"left out {self.hot_pixels_left_out:,} hot pixels, 3 times busier than their neighbours")
             if self.refractory_us:
-                CONSOLE.print(f"pixels are blind for {self.refractory_us:,} us after an event")
+                say(f"pixels are blind for {self.refractory_us:,} us after an event")
 
     def setup_eval(self) -> None:
         """The loaders of full views that nerfstudio's scripts ask for."""
@@ -167,7 +167,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         flicker = flicker_hz(index.events, index.first, clock_step_us(index.events["t_us"]))
         if not 0 < flicker.share_of_pixels < _MOST_FLICKER:
             return index
-        CONSOLE.print(f"left out {flicker.pixels.sum():,} pixels that follow a lamp of {flicker.hz:.1f} Hz")
+        say(f"left out {flicker.pixels.sum():,} pixels that follow a lamp of {flicker.hz:.1f} Hz")
         return index.without(flicker.pixels)
 
     @cached_property

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from math import exp, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from ebarf_ns.errors import EvaluationError
 from ebarf_ns.evaluation.report import read_metrics
 from ebarf_ns.export.subject import Seen
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
@@ -75,13 +77,22 @@ def open_run(folder: Path) -> FinishedRun:
     No code in the folder is run. Raises :class:`EvaluationError`, and what its scene and checkpoints raise.
     """
     config = read_run_config(folder / "config.yml")
-    checkpoint, _ = newest_whole(folder / "nerfstudio_models")
+    checkpoint, damaged = newest_whole(folder / "nerfstudio_models")
+    for error in damaged:
+        sys.stderr.write(f"{error}; {checkpoint.name} is taken\n")
     if (folder / "scene" / "scene.json").is_file():
         config.pipeline.datamanager.dataparser.kept = folder / "scene"  # pyright: ignore[reportAttributeAccessIssue]
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    pipeline: EbarfPipeline = config.pipeline.setup(device=device, test_mode="inference").eval()
     state = read_checkpoint(checkpoint)
-    pipeline.load_pipeline(state["pipeline"], state["step"])
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        pipeline: EbarfPipeline = config.pipeline.setup(device=device, test_mode="inference").eval()
+        pipeline.load_pipeline(state["pipeline"], state["step"])
+    except (AttributeError, TypeError, ValueError, LookupError, RuntimeError, MemoryError) as error:
+        # What is in the two files may be anything.
+        said = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
+        raise EvaluationError(
+            f"{folder}: cannot be opened ({said}), expected config.yml and {checkpoint.name} to be of one ebarf run"
+        ) from None
     # Nothing is learned any more: a time constant of zero counts as no delay.
     pipeline.requires_grad_(False)
     return FinishedRun(pipeline, _sensor(pipeline, folder))

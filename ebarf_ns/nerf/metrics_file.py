@@ -1,12 +1,14 @@
 """``metrics.jsonl`` of a run: a header, then one line for each evaluation; and what it knows its scene by."""
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from ebarf_ns.errors import TrainingError
 from ebarf_ns.files import whole_file
 from ebarf_ns.scene import Scene
 
@@ -20,12 +22,11 @@ _PLACES = {
 def begin_metrics(run: Path, header: Callable[[], dict[str, Any]], start_step: int) -> None:
     """Write the header; a run that goes on in its own folder keeps what was evaluated up to ``start_step``."""
     path = run / _NAME
-    goes_on = start_step and path.is_file()
-    first, *records = path.read_text(encoding="utf-8").splitlines() if goes_on else [json.dumps(header())]
+    first, *records = (_lines(path) if start_step and path.is_file() else []) or [header()]
     # What was evaluated after the checkpoint will be again.
-    records = [record for record in records if json.loads(record)["step"] <= start_step]
+    records = [record for record in records if record.get("step", 0) <= start_step]
     with whole_file(path) as temporary:
-        temporary.write_text("\n".join([first, *records]) + "\n", encoding="utf-8")
+        temporary.write_text("".join(json.dumps(line) + "\n" for line in (first, *records)), encoding="utf-8")
 
 
 def record_metrics(run: Path, record: dict[str, Any]) -> None:
@@ -38,9 +39,23 @@ def record_metrics(run: Path, record: dict[str, Any]) -> None:
 
 
 def read_header(run: Path) -> dict[str, Any]:
-    """The header; empty where there is no file."""
+    """The header; empty where there is no file, or nothing in it. Raises :class:`TrainingError`."""
     path = run / _NAME
-    return json.loads(path.read_text(encoding="utf-8").splitlines()[0]) if path.is_file() else {}
+    return next(iter(_lines(path)), {}) if path.is_file() else {}
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    """All lines up to the first that is cut off."""
+    lines = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        try:
+            lines.append({**json.loads(line)})
+        except (ValueError, TypeError):
+            if number == 1:
+                raise TrainingError(f"{path}:1: holds {line[:40]!r}, expected the header of a run") from None
+            sys.stderr.write(f"{path}:{number}: is cut off; what follows is left out\n")
+            break
+    return lines
 
 
 def scene_digest(scene: Scene) -> dict[str, str]:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from ebarf_ns.errors import EvaluationError, one_line_errors
@@ -26,6 +25,7 @@ from ebarf_ns.nerf.datamanager import EventDataManager
 from ebarf_ns.nerf.dataparser import Normalization, frame_cameras, replace_intrinsics
 from ebarf_ns.nerf.metrics_file import changed_parts, read_header
 from ebarf_ns.nerf.model import EbarfModel
+from ebarf_ns.nerf.terminal import say
 from ebarf_ns.nerf.upgrades import completed
 from ebarf_ns.scene import Frame, Scene
 
@@ -163,7 +163,7 @@ class EbarfPipeline(VanillaPipeline):
             what = f"step-{step:09d}.ckpt"
             state, self.upgraded = completed(unsealed(loaded_state, what), self.state_dict(), what)
             if self.upgraded:
-                CONSOLE.print(f"{what} is of an earlier version: {', '.join(self.upgraded)} start as in a new training")
+                say(f"{what} is of an earlier version: {', '.join(self.upgraded)} start as in a new training")
             super().load_pipeline(state, step)
             self.datamanager.shift_clock(int(self.model.camera_optimizer.clock_offset_us))
         if self.test_mode != "val":

@@ -2,7 +2,7 @@
 
 Nerfstudio dumps configurations as YAML that names classes and has its loader call them, so that a stranger's file can
 run anything. Here only the classes and functions that this package's own configurations hold can be named, and none of
-them is called but enumerations and paths.
+them is called but enumerations and paths. Opening the run then calls each configuration's own target.
 """
 
 from __future__ import annotations
@@ -48,11 +48,16 @@ class _Loader(yaml.SafeLoader):
 
 
 def _object(loader: _Loader, name: str, node: yaml.Node) -> Iterator[Any]:
-    made = object.__new__(_looked_up(name, node))
+    kind = _looked_up(name, node)
+    if kind not in _configurations() or not isinstance(node, yaml.MappingNode):
+        raise _refused(f"{name} is no configuration", node)
+    made = object.__new__(kind)
     yield made
-    if not (is_dataclass(made) and isinstance(node, yaml.MappingNode)):
-        raise yaml.constructor.ConstructorError(None, None, f"{name} is no configuration", node.start_mark)
-    vars(made).update(loader.construct_mapping(node, deep=True))
+    values = loader.construct_mapping(node, deep=True)
+    # Nerfstudio calls what a configuration has as its target.
+    if values.get("_target") not in _configurations()[kind]:
+        raise _refused(f"{name} has a target of another configuration", node)
+    vars(made).update(values)
 
 
 def _applied(loader: _Loader, name: str, node: yaml.Node) -> Any:
@@ -63,7 +68,7 @@ def _applied(loader: _Loader, name: str, node: yaml.Node) -> Any:
             return Path(*values)
         if issubclass(made, Enum) and len(values) == 1 and values[0] in [one.value for one in made]:
             return made(values[0])
-    raise yaml.constructor.ConstructorError(None, None, f"no value of {name}", node.start_mark)
+    raise _refused(f"no value of {name}", node)
 
 
 def _looked_up(name: str, node: yaml.Node) -> Any:
@@ -75,34 +80,52 @@ def _looked_up(name: str, node: yaml.Node) -> Any:
         if not any(found is one for one in _known()):
             raise ImportError
     except (ImportError, AttributeError):
-        message = f"it names {name}, which no configuration of this package holds"
-        raise yaml.constructor.ConstructorError(None, None, message, node.start_mark) from None
+        raise _refused(f"it names {name}, which no configuration of this package holds", node) from None
     return found
+
+
+def _refused(why: str, node: yaml.Node) -> yaml.constructor.ConstructorError:
+    return yaml.constructor.ConstructorError(None, None, why, node.start_mark)
 
 
 @cache
 def _known() -> tuple[Any, ...]:
     """The classes and functions in this package's configurations, and the paths."""
-    held = _held([method.config for method in (ebarf, ebarf_paper, enerf)])
-    return *dict.fromkeys(held), PosixPath, WindowsPath
+    named = [PosixPath, WindowsPath]
+    for value in _values([method.config for method in (ebarf, ebarf_paper, enerf)]):
+        named.append(value if callable(value) else type(value))
+    return tuple(dict.fromkeys(named))
 
 
-def _held(value: object) -> Iterator[Any]:
-    if isinstance(value, type) or callable(value):
+@cache
+def _configurations() -> dict[type, list[Any]]:
+    """The classes of this package's configurations, and the targets that those of each class have."""
+    targets: dict[type, list[Any]] = {}
+    for value in _values([method.config for method in (ebarf, ebarf_paper, enerf)]):
+        if is_dataclass(value) and not isinstance(value, type):
+            targets.setdefault(type(value), []).append(getattr(value, "_target", None))
+    return targets
+
+
+def _values(value: object) -> Iterator[Any]:
+    """All values in a nested configuration that a file names by a class or a function."""
+    if isinstance(value, type | Enum) or callable(value):
         yield value
-    elif isinstance(value, Enum):
-        yield type(value)
     elif is_dataclass(value):
-        yield type(value)
-        yield from _held([getattr(value, field.name) for field in fields(value)])
+        yield value
+        yield from _values([getattr(value, field.name) for field in fields(value)])
     elif isinstance(value, dict):
-        yield from _held(list(value.values()))
+        yield from _values(list(value.values()))
     elif isinstance(value, list | tuple):
         for one in value:
-            yield from _held(one)
+            yield from _values(one)
 
 
-_Loader.add_constructor(f"{_TAG}tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+def _tuple(loader: _Loader, node: yaml.SequenceNode) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+_Loader.add_constructor(f"{_TAG}tuple", _tuple)
 _Loader.add_multi_constructor(f"{_TAG}object:", _object)
 _Loader.add_multi_constructor(f"{_TAG}object/apply:", _applied)
 _Loader.add_multi_constructor(f"{_TAG}name:", lambda loader, name, node: _looked_up(name, node))

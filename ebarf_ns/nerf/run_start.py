@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import shlex
 import sys
+from copy import deepcopy
 from dataclasses import asdict, replace
 from datetime import date
 from importlib.metadata import version
@@ -13,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.events.recording import RecordingFile
@@ -23,6 +23,7 @@ from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.machine import free_threads
 from ebarf_ns.nerf.dataparser import keep_scene, moved
 from ebarf_ns.nerf.metrics_file import changed_parts, config_digest, flags_of, scene_digest
+from ebarf_ns.nerf.terminal import say
 from ebarf_ns.odometry.output import complete_scene
 from ebarf_ns.plan import Line, apply_plan, plan_for
 from ebarf_ns.radiance.hash_grid import fastest_backend
@@ -42,7 +43,7 @@ def read_scene_of(config: TrainerConfig) -> Scene:
     if datamanager.dataparser.kept and not folder.is_dir():
         raise TrainingError(moved(replace(datamanager.dataparser, data=folder)))
     if getattr(config, "estimate_trajectory", False):
-        complete_scene(folder, lambda sentence: CONSOLE.print(sentence, soft_wrap=True))
+        complete_scene(folder, lambda sentence: say(sentence))
     return read_scene(folder)
 
 
@@ -83,16 +84,22 @@ def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str,
     return apply_plan([resumed.get(line.field, line) for line in lines], config)
 
 
-def keep_run(config: TrainerConfig, scene: Scene, folder: Path) -> None:
+def opening_config(config: TrainerConfig, folder: Path) -> str:
+    """What ``config.yml`` has to say for scripts that open the run; building the pipeline changes the configuration."""
+    # Scripts take the newest checkpoint, whatever the run was begun from.
+    opened: Any = deepcopy(replace(config, load_dir=None, load_step=None, load_checkpoint=None))
+    opened.pipeline.datamanager.dataparser.kept = folder / "scene"
+    return yaml.dump(opened)
+
+
+def keep_run(opening: str, config: TrainerConfig, scene: Scene, folder: Path) -> None:
     """Write what opens the run again: its configuration, and what it needs of its scene."""
     kept = folder / "scene"
     keep_scene(scene, kept)
     datamanager: Any = config.pipeline.datamanager
     datamanager.dataparser.kept = kept
-    # Scripts that open the run take its newest checkpoint, whatever it was begun from.
-    opened = replace(config, load_dir=None, load_step=None, load_checkpoint=None)
     with whole_file(folder / "config.yml") as temporary:
-        temporary.write_text(yaml.dump(opened), encoding="utf-8")
+        temporary.write_text(opening, encoding="utf-8")
 
 
 def run_header(

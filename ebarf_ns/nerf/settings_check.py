@@ -8,6 +8,8 @@ from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import torch
+from rich.errors import MarkupError
+from rich.text import Text
 
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.old_flags import warn_of_old_flags
@@ -73,6 +75,13 @@ def check_settings(config: TrainerConfig) -> None:
         value = reduce(getattr, flag.split("."), config)
         if value is not None and not value >= least:
             raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
+    try:
+        # Nerfstudio prints the folder of the run as rich markup.
+        Text.from_markup(str(config.get_base_dir()))
+    except MarkupError:
+        raise TrainingError(
+            f"{config.get_base_dir()}: cannot be printed by nerfstudio, expected a folder without '[/'"
+        ) from None
     pipeline: Any = config.pipeline
     silent = pipeline.datamanager.silent_share
     if silent and pipeline.model.loss == "normalized":

@@ -1,19 +1,27 @@
-"""Ctrl-C and SIGTERM."""
+"""Ctrl-C, SIGTERM, and a terminal that is closed."""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
+from ebarf_ns.nerf.terminal import say
+
+# Windows knows no SIGHUP.
+_ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 @contextmanager
 def signals_to(handle: Callable[[int], None]) -> Iterator[None]:
-    """Call ``handle`` with the number of the first SIGINT or SIGTERM; a second one ends the process at once."""
+    """Call ``handle`` with the number of the first SIGINT, SIGTERM or SIGHUP; a second one ends the process at once.
+
+    SIGHUP stays ignored where it is, as nohup has it.
+    """
 
     def first(number: int, _: Any) -> None:
         for one in before:
@@ -23,7 +31,8 @@ def signals_to(handle: Callable[[int], None]) -> Iterator[None]:
     before: dict[int, Any] = {}
     # Python hands signals to the main thread alone.
     if threading.current_thread() is threading.main_thread():
-        before = {one: signal.signal(one, first) for one in (signal.SIGINT, signal.SIGTERM)}
+        ignored = [one for one in _ENDING if one != signal.SIGINT and signal.getsignal(one) == signal.SIG_IGN]
+        before = {one: signal.signal(one, first) for one in _ENDING if one not in ignored}
     try:
         yield
     finally:
@@ -31,7 +40,44 @@ def signals_to(handle: Callable[[int], None]) -> Iterator[None]:
             signal.signal(one, handler)
 
 
+@contextmanager
+def output_may_end() -> Iterator[None]:
+    """Go on in silence where nobody takes the output any more: a closed terminal, a pipe whose reader has ended."""
+    with ExitStack() as streams:
+        streams.enter_context(redirect_stdout(_Unfailing(sys.stdout)))  # pyright: ignore[reportArgumentType]
+        streams.enter_context(redirect_stderr(_Unfailing(sys.stderr)))  # pyright: ignore[reportArgumentType]
+        yield
+
+
+class _Unfailing:
+    """A stream of text that loses what cannot be written."""
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with self._or_nowhere():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with self._or_nowhere():
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @contextmanager
+    def _or_nowhere(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:
+            # What the stream still holds would fail again when it is closed.
+            with suppress(OSError), open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), self._stream.fileno())
+
+
 def end(number: int) -> None:
-    """Leave with the exit code that shells know a signal by: 130 or 143."""
-    CONSOLE.print(f"{signal.Signals(number).name}: ends")
+    """Leave with the exit code that shells know a signal by: 130, 143 or 129."""
+    say(f"{signal.Signals(number).name}: ends")
     raise SystemExit(128 + number)

@@ -15,6 +15,11 @@ from ebarf_ns.scene import Scene
 Results = Mapping[str, Any]
 
 
+def say(text: str) -> None:
+    """Print text as it is: a path may hold what rich takes for markup."""
+    CONSOLE.print(text, markup=False, soft_wrap=not CONSOLE.is_terminal)
+
+
 def scene_line(scene: Scene, events: int, keyframes: int) -> str:
     """What is trained on."""
     given = scene.contrast_threshold

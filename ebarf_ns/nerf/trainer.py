@@ -11,9 +11,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from ebarf_ns.errors import TrainingError, one_line_errors
+from ebarf_ns.errors import EbarfError, TrainingError, one_line_errors
 from ebarf_ns.evaluation.report import write_report
 from ebarf_ns.evaluation.trajectory_error import trajectory_results
 from ebarf_ns.geometry.trajectory_file import read_tum, write_tum
@@ -22,20 +21,28 @@ from ebarf_ns.memory import peak_memory_mib
 from ebarf_ns.nerf import optimizers
 from ebarf_ns.nerf.alignment import NOT_ALIGNED, Alignment, align
 from ebarf_ns.nerf.averaging import Averaging
-from ebarf_ns.nerf.checkpoints import chosen_checkpoint, not_finite, read_checkpoint, write_checkpoint
+from ebarf_ns.nerf.checkpoints import checkpoints_in, chosen_checkpoint, not_finite, read_checkpoint, write_checkpoint
 from ebarf_ns.nerf.guard import GuardedOptimizers
 from ebarf_ns.nerf.metrics_file import begin_metrics, flags_of, read_header
 from ebarf_ns.nerf.moments import write_moments
 from ebarf_ns.nerf.pipeline import EbarfPipeline
 from ebarf_ns.nerf.replay import write_replay
 from ebarf_ns.nerf.run_evaluation import record_evaluation, write_refined
-from ebarf_ns.nerf.run_folder import take_folder
-from ebarf_ns.nerf.run_start import check_scene_is_the_same, keep_run, plan_run, read_scene_of, run_header
+from ebarf_ns.nerf.run_folder import remove_checkpoints, take_folder
+from ebarf_ns.nerf.run_start import (
+    check_scene_is_the_same,
+    keep_run,
+    opening_config,
+    plan_run,
+    read_scene_of,
+    run_header,
+)
 from ebarf_ns.nerf.settings_check import changed_flags, check_settings
-from ebarf_ns.nerf.signals import end, signals_to
+from ebarf_ns.nerf.signals import end, output_may_end, signals_to
 from ebarf_ns.nerf.support import Support, support
-from ebarf_ns.nerf.terminal import LiveLine, evaluation_line, plan_line, scene_line, summary
+from ebarf_ns.nerf.terminal import LiveLine, evaluation_line, plan_line, say, scene_line, summary
 from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
+from ebarf_ns.nerf.trainer_state import restore, trainer_state
 from ebarf_ns.nerf.warm_up import compile_kernels
 
 # Where config.yml of earlier versions looks for them.
@@ -77,6 +84,7 @@ class EbarfTrainer(Trainer):
                         f"the loaded run has used its budget ({self.steps_done} steps, {self.train_seconds:.0f} s); "
                         "expected a larger --max-num-iterations or --max-train-seconds to go on"
                     )
+                self._keep()
             except BaseException:
                 self._release_folder()
                 raise
@@ -87,9 +95,7 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def _take_folder(self) -> None:
-        loaded = self._loaded_path
-        goes_on = loaded is not None and loaded.parent.resolve() == (self.base_dir / "nerfstudio_models").resolve()
-        self.lock = take_folder(self.base_dir, goes_on, self.config.overwrite)
+        self.lock = take_folder(self.base_dir, self._goes_on, self.config.overwrite)
 
     def _plan(self) -> None:
         """Fill in what the configuration leaves to the plan, and keep it with the run."""
@@ -97,16 +103,28 @@ class EbarfTrainer(Trainer):
         if self._loaded_path and not self.config.allow_changed_scene:
             check_scene_is_the_same(scene, header, self._loaded_path)
         self.plan = plan_run(self.config, scene, self.device, header)
+        self.opening = opening_config(self.config, self.base_dir)
         use_threads(self.config.threads)
-        if self.local_rank == 0:
-            keep_run(self.config, scene, self.base_dir)
+
+    @check_main_thread
+    def _keep(self) -> None:
+        """Nothing stands in the way of the training any more: what the folder held of another run goes."""
+        if not self._goes_on:
+            remove_checkpoints(self.base_dir)
+        keep_run(self.opening, self.config, self.pipeline.scene, self.base_dir)
 
     @check_main_thread
     def _say_plan(self) -> None:
         scene, given = self.pipeline.scene, self.pipeline.trajectory(refined=False)
         self.errors_given = trajectory_results(given, read_tum(scene.groundtruth)) if scene.groundtruth else {}
-        CONSOLE.print(scene_line(scene, len(self.pipeline.datamanager.index.events), len(given.t_us)))
-        CONSOLE.print(plan_line(self.plan))
+        say(scene_line(scene, len(self.pipeline.datamanager.index.events), len(given.t_us)))
+        say(plan_line(self.plan))
+
+    @property
+    def _goes_on(self) -> bool:
+        """Whether a run goes on in its own folder."""
+        loaded = self._loaded_path
+        return loaded is not None and loaded.parent.resolve() == (self.base_dir / "nerfstudio_models").resolve()
 
     @cached_property
     def _header_of_resumed_run(self) -> dict[str, Any]:
@@ -126,7 +144,7 @@ class EbarfTrainer(Trainer):
                 torch.distributed.broadcast(found, 0)
             self.pipeline.datamanager.shift_clock(int(model.camera_optimizer.clock_offset_us))
         self.train_seconds = self._agreed(monotonic() - started)
-        CONSOLE.print(str(self.alignment or NOT_ALIGNED))
+        say(str(self.alignment or NOT_ALIGNED))
 
     def _has_budget_for_coarse_fields(self) -> bool:
         """Too few steps find nothing, and say so of any trajectory."""
@@ -148,9 +166,9 @@ class EbarfTrainer(Trainer):
         return max(by_steps, self.train_seconds / seconds if seconds else 0.0)
 
     def train(self) -> None:
-        """Train to the end of the budget, or to a signal: 130 or 143 is then the exit code, and nothing is lost."""
+        """Train to the end of the budget, or to a signal: nothing is lost, and the exit code is 128 and its number."""
         try:
-            with one_line_errors(), signals_to(self._stop):
+            with one_line_errors(), output_may_end(), signals_to(self._stop):
                 self._begin_metrics()
                 with self.live:
                     super().train()
@@ -163,7 +181,7 @@ class EbarfTrainer(Trainer):
         if self.training_state == "completed":
             # All is saved, and the viewer is what still runs.
             end(number)
-        CONSOLE.print("ends after this step; a second signal ends it at once")
+        say("ends after this step; a second signal ends it at once")
         self.signal, self.stop_training = number, True
 
     def _after_train(self) -> None:
@@ -187,7 +205,7 @@ class EbarfTrainer(Trainer):
     def _write_report(self) -> None:
         write_report(self.base_dir, self.pipeline.scene.groundtruth)
         wall_seconds = monotonic() - self.begun_s
-        CONSOLE.print(summary(self.base_dir, self.train_seconds, wall_seconds, self.results, self.errors_given))
+        say(summary(self.base_dir, self.train_seconds, wall_seconds, self.results, self.errors_given))
 
     def _check_viewer_warnings(self) -> None:
         """Nerfstudio's says that nothing is evaluated, which is not so here."""
@@ -219,7 +237,12 @@ class EbarfTrainer(Trainer):
             # Evaluation may fail, or take long: what was learned is safe before.
             self.save_checkpoint(step)
         if int(after * self.config.evaluations) > int(before * self.config.evaluations) or after >= 1:
-            self._evaluate(self.last_loss)
+            try:
+                self._evaluate(self.last_loss)
+            except (EbarfError, OSError):
+                # The scene's folder may be gone.
+                self.save_checkpoint(step)
+                raise
         if after >= 1 or self.signal:
             self.stop_training = True
         self.live.update(after, self.steps_done, self.train_seconds, monotonic() - started, self.last_loss)
@@ -234,7 +257,7 @@ class EbarfTrainer(Trainer):
             self.save_checkpoint(step)
         except TrainingError as error:
             return f"; {error}"
-        saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
+        saved = checkpoints_in(self.checkpoint_dir)
         again = f"; --load-checkpoint {saved[-1]} goes on from before" if saved else ""
         return f"; ebarf replay {replay} looks for where they begin{again}"
 
@@ -254,7 +277,7 @@ class EbarfTrainer(Trainer):
             results = self.pipeline.evaluate(self.base_dir / "renders" if final else None)
             write_refined(self.pipeline, self.base_dir)
             if final:
-                CONSOLE.print("trained; the trajectory is now checked on held-out events")
+                say("trained; the trajectory is now checked on held-out events")
                 write_moments(self.pipeline, self.base_dir / "moments.npz")
             found = self._support() if final else None
         self.results = {
@@ -267,9 +290,9 @@ class EbarfTrainer(Trainer):
             "peak_memory_mib": round(peak_memory_mib(self.device), 1),
         }
         record_evaluation(self.results, found, self.base_dir)
-        CONSOLE.print(evaluation_line(self.train_seconds, self.steps_done, self.results, self.errors_given))
+        say(evaluation_line(self.train_seconds, self.steps_done, self.results, self.errors_given))
         if found:
-            CONSOLE.print(str(found))
+            say(str(found))
 
     def _support(self) -> Support | None:
         """What held-out events say of the refined trajectory, where there is the budget to ask them."""
@@ -294,24 +317,9 @@ class EbarfTrainer(Trainer):
         path = self.checkpoint_dir / f"step-{last:09d}.ckpt"
         if self.saved_step == self.steps_done and path.is_file():
             return
-        with self.averaging.shown():
-            pipeline = {name: value.clone() for name, value in self.pipeline.state_dict().items()}
-        state = {
-            "step": last,
-            "pipeline": pipeline,
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
-            "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
-            "scalers": self.grad_scaler.state_dict(),
-            "ebarf": {
-                "train_seconds": self.train_seconds,
-                "event_pairs": self.event_pairs,
-                **self.optimizers.guard_state(),
-                # Those of the pipeline are the mean: what everybody but a resumed training is after.
-                "trained": [parameter.detach().clone() for parameter in self.averaging.parameters],
-            },
-        }
+        state = trainer_state(self, last)
         if name := not_finite(state):
-            CONSOLE.print(f"no checkpoint of step {self.steps_done}, which is not finite in {name}: older ones stay")
+            say(f"no checkpoint of step {self.steps_done}, which is not finite in {name}: older ones stay")
             return
         write_checkpoint(state, path)
         self.saved_step = self.steps_done
@@ -321,30 +329,14 @@ class EbarfTrainer(Trainer):
         if path is None:
             return
         state = read_checkpoint(path)
-        ours = state.get("ebarf", {})
         changed = changed_flags(self._header_of_resumed_run.get("flags", {}), flags_of(self.config))
-        try:
-            self.pipeline.load_pipeline(state["pipeline"], state["step"])
-            # The moments of an earlier version may be those of other parameters.
-            fits = not self.pipeline.upgraded
-            self.averaging.begin_from(ours.get("trained") if fits else None)
-            self.optimizers.load_optimizers(state["optimizers"] if fits else {})
-            if self.config.load_scheduler:
-                self.optimizers.load_schedulers(state["schedulers"])
-            self.grad_scaler.load_state_dict(state["scalers"])
-        except (RuntimeError, LookupError, TypeError, ValueError) as error:
-            said = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
-            expected = f"expected a run's checkpoint, with the flags it was made by{changed and f': {changed}'}"
-            raise TrainingError(f"{path}: cannot go on from it ({said}), {expected}") from None
+        restore(self, state, path, changed)
         self._start_step = self.steps_done = state["step"] + 1
-        self.train_seconds = ours.get("train_seconds", 0.0)
-        self.event_pairs = ours.get("event_pairs", 0)
-        self.optimizers.load_guard_state(ours)
-        CONSOLE.print(f"goes on from {path}{changed and f', which was made by {changed}'}")
+        say(f"goes on from {path}{changed and f', which was made by {changed}'}")
 
     @cached_property
     def _loaded_path(self) -> Path | None:
         path, damaged = chosen_checkpoint(self.config)
         for error in damaged:
-            CONSOLE.print(f"{error}; goes on from an older one")
+            say(f"{error}; goes on from an older one")
         return path

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from ebarf_ns.errors import one_line_errors
-from ebarf_ns.nerf.checkpoints import newest_whole
+from ebarf_ns.nerf.checkpoints import checkpoints_in, newest_whole
 from ebarf_ns.nerf.settings_check import check_machine, check_settings
+from ebarf_ns.nerf.terminal import say
 
 _HOST_FLAG, _EVERYWHERE = "--viewer.websocket-host", "0.0.0.0"
 
@@ -62,13 +62,13 @@ class EbarfTrainerConfig(TrainerConfig):
         """Config.yml has all of it; what matters is said as the plan."""
 
     def get_checkpoint_dir(self) -> Path:
-        """Where checkpoints lie; scripts that open a run, and take the newest, are led past those that are damaged."""
+        """Where checkpoints lie; scripts that open a run are led to the newest whole one."""
         folder = super().get_checkpoint_dir()
         opened = self.pipeline.datamanager.dataparser.kept is not None  # pyright: ignore[reportAttributeAccessIssue]
-        if opened and self.load_dir is None and self.load_step is None and any(folder.glob("step-*.ckpt")):
+        if opened and self.load_dir is None and self.load_step is None and checkpoints_in(folder):
             with one_line_errors():
                 path, damaged = newest_whole(folder)
             for error in damaged:
-                CONSOLE.print(f"{error}; {path.name} is taken")
-            self.load_step = int(path.stem.removeprefix("step-")) if damaged else None
+                say(f"{error}; {path.name} is taken")
+            self.load_step = int(path.stem.removeprefix("step-"))
         return folder

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from ebarf_ns.nerf.terminal import say
+
 if TYPE_CHECKING:
     from ebarf_ns.nerf.pipeline import EbarfPipeline
 
@@ -34,5 +36,5 @@ def compile_kernels(pipeline: EbarfPipeline) -> float:
             model.train(was_training)
     seconds = monotonic() - started
     if seconds > _REPORTED_ABOVE_S:
-        CONSOLE.print(f"compiled kernels in {seconds:.0f} s (once per machine, not counted as training time)")
+        say(f"compiled kernels in {seconds:.0f} s (once per machine, not counted as training time)")
     return seconds

@@ -1,7 +1,11 @@
 """The ebarf command as users type it: what it prints, what it leaves, and what it says when it cannot."""
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -129,6 +133,43 @@ def test_trajectory_perturb_is_repeatable(tiny_scene: Path, tmp_path: Path):
     assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
     given, moved = read_tum(tiny_scene / "groundtruth.txt"), read_tum(tmp_path / "a.txt")
     assert 0.01 < float((given.poses.position - moved.poses.position).std()) < 0.06
+
+
+def test_trajectory_perturb_does_not_write_over_what_it_reads(tiny_scene: Path, tmp_path: Path):
+    path = Path(shutil.copy(tiny_scene / "groundtruth.txt", tmp_path / "given.txt"))
+    finished = run_command("ebarf", "trajectory", "perturb", path, path)
+    assert finished.code == 2 and "expected another file to write" in finished.errors
+    assert path.read_bytes() == (tiny_scene / "groundtruth.txt").read_bytes()
+
+
+SLOW_COMMAND = """
+import signal, sys, time
+from pathlib import Path
+from ebarf_ns.cli import entry, main
+from ebarf_ns.files import whole_file, whole_folder
+
+def write_slowly():
+    with whole_folder(Path(sys.argv[2])) as folder, whole_file(Path(sys.argv[2] + ".txt")):
+        (folder / "half").touch()
+        print("begun", flush=True)
+        time.sleep(60)
+
+# A shell may have left it ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+main.entrypoint = write_slowly
+entry.entrypoint()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such signals there")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_command_that_is_told_to_end_leaves_nothing_half_written(tmp_path: Path, number: int, code: int):
+    command = [sys.executable, "-c", SLOW_COMMAND, "simulate", tmp_path / "scene"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout and running.stdout.readline() == "begun\n"
+        running.send_signal(number)
+        _, said = running.communicate(timeout=30)
+    assert running.returncode == code and "Traceback" not in said and not list(tmp_path.iterdir())
 
 
 def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):

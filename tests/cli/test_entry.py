@@ -37,7 +37,7 @@ def test_all_commands_are_listed_and_no_others(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(sys, "argv", ["ebarf", "--help"])
     with pytest.raises(SystemExit):
         commands()
-    (listed,) = re.findall(r"\{([\w,-]+)\}", capsys.readouterr().out)[:1]
+    (listed,) = re.findall(r"\{([\w,-]+)\}", "".join(capsys.readouterr().out.split()))[:1]
     assert {*listed.split(","), "train"} == set(COMMANDS)
     for name in COMMANDS:
         assert "usage" in run_ok("ebarf", name, "--help").lower()

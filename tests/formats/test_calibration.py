@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ebarf_ns.errors import SceneError
-from ebarf_ns.formats.calibration import read_calibration, read_cameras
+from ebarf_ns.formats.calibration import camera_notes, read_calibration, read_cameras
+from ebarf_ns.formats.process import ProcessSettings, process
 from ebarf_ns.geometry.cameras import Camera
 
 MATRIX = "[ 60., 0., 32., 0., 61., 24., 0., 0., 1. ]"
@@ -200,3 +201,108 @@ def test_a_sensor_size_missing_in_the_file_can_be_given(tmp_path: Path):
     path.write_text(f"camera_matrix: {MATRIX}\n")
     camera = next(iter(read_cameras(path, (64, 48)).values())).camera
     assert (camera.width, camera.height, camera.model) == (64, 48, "pinhole")
+
+
+NAMED = "fx: 60\nfy: 61\ncx: 32\ncy: 24\nwidth: 64\nheight: 48\n"
+PLAIN = f"camera_matrix: {{data: {MATRIX}}}\nimage_width: 64\nimage_height: 48\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(NAMED + f"{key}: [-0.1, 0.02, 0, 0]\n" for key in ("dist", "dist_coeff", "distortion_coefs", "coeffs")),
+        PLAIN + "dist: [[-0.1, 0.02, 0, 0, 0]]\n",
+        NAMED + "radial: [-0.1, 0.02]\ntangential: [0, 0]\n",
+        NAMED + "RadialDistortion: [-0.1, 0.02, 0]\n",
+        NAMED + "distortion: {type: radtan, parameters: [-0.1, 0.02, 0, 0]}\n",
+        NAMED + "distortion: {coefficients: [-0.1, 0.02, 0, 0]}\n",
+        "cam0: {intrinsics: {fx: 60, fy: 61, cx: 32, cy: 24}, resolution: {width: 64, height: 48}, "
+        "distortion: {model: plumb_bob, coeffs: [-0.1, 0.02, 0, 0]}}\n",
+        NAMED + "distortion: {k1: -0.1, k2: 0.02, p1: 0, p2: 0}\nk1: 0\n",
+        NAMED + "k1: -0.1\nk2: 0.02\np1: 0\np2: 0\nk4: 0\ndistance: 5\n",
+        PLAIN
+        + "D: [-0.1, 0.02, 0, 0]\ndist_coeffs: [-0.1, 0.02, 0, 0, 0]\nP1: [60, 0, 32, 0, 0, 61, 24, 0, 0, 0, 1, 0]\n",
+    ],
+)
+def test_distortion_is_read_under_any_of_its_names(tmp_path: Path, text: str):
+    camera = camera_of(tmp_path, "a.yaml", text)
+    assert camera.model == "radtan" and camera.distortion[:4] == (-0.1, 0.02, 0, 0)
+
+
+@pytest.mark.parametrize("lens", ["equidistant", "fisheye"])
+def test_a_nested_model_of_the_lens_counts(tmp_path: Path, lens: str):
+    text = NAMED + f"distortion: {{type: {lens}, parameters: [-0.1, 0.02, 0, 0]}}\n"
+    assert camera_of(tmp_path, "a.yaml", text).model == "equidistant"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (NAMED + "k1: -0.1\nk2: 0.02\np1: 0\np2: 0\nk3: 0\nk4: 0.1\n", "k4 is 0.1, expected 0 or no such key"),
+        (NAMED + "distortion_of_mine: [-0.1, 0.02, 0, 0]\n", "distortion_of_mine is .* expected 0 or no such key"),
+        (NAMED + "distortion: {mine: [-0.1, 0.02, 0, 0]}\n", "distortion is .*, expected radtan's"),
+        (NAMED + "distortion_model: radtan\n", "distortion_coeffs is missing, expected radtan's .* none"),
+        (NAMED + "distortion: {type: fov, parameters: [0.9]}\n", "distortion.type is 'fov', expected one of"),
+        (PLAIN.replace("60., 0.", "60., 5."), "camera_matrix is .* without the skew of 5"),
+        (PLAIN.replace(MATRIX, "[60, 0, 0, 0, 61, 0, 32, 24, 1]"), "camera_matrix is .*transposed, as MATLAB"),
+        (PLAIN.replace(MATRIX, "[60, 0, 32, 0, 61, 24, 0, 0, 2]"), "expected rows of fx 0 cx, 0 fy cy and 0 0 1"),
+        (PLAIN.replace("64", "48", 1).replace("height: 48", "height: 64"), "middle of 64 by 48; expected the width f"),
+        (PLAIN + "binning_x: 2\nbinning_y: 2\n", "binning_x is 2, expected 0 or 1"),
+        (PLAIN + "roi: {x_offset: 10, y_offset: 0}\n", "roi.x_offset is 10, expected"),
+        (PLAIN + "roi: {x_offset: 0, y_offset: 0, height: 20, width: 64}\n", "roi.height is 20, expected"),
+    ],
+)
+def test_what_would_change_the_camera_is_not_passed_over(tmp_path: Path, text: str, words: str):
+    with pytest.raises(SceneError, match=words):
+        camera_of(tmp_path, "a.yaml", text)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        "distortion_model: plumb_bob\nD: []\nbinning_x: 0\nbinning_y: 1\nroi: {x_offset: 0, height: 48, width: 64}\n",
+        "roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}\n",
+        "distortion_model: none\n",
+    ],
+)
+def test_cameras_as_recorded_without_distortion_are_pinholes(tmp_path: Path, more: str):
+    assert camera_of(tmp_path, "a.yaml", PLAIN + more).model == "pinhole"
+
+
+@pytest.mark.parametrize("size", ["", "<image_width>64</image_width>"])
+@pytest.mark.parametrize(("flag", "model"), [("1", "equidistant"), ("0", "radtan")])
+def test_dvs_fisheye_flag_stands_beside_the_camera(tmp_path: Path, flag: str, model: str, size: str):
+    text = f"<opencv_storage><DVX_1>{XML_CAMERA}</DVX_1><use_fisheye_model>{flag}</use_fisheye_model>{size}"
+    assert camera_of(tmp_path, "dv.xml", f"{text}<type>camera</type></opencv_storage>").model == model
+
+
+def test_an_assumed_model_is_noted(tmp_path: Path):
+    (tmp_path / "a.yaml").write_text(PLAIN + "D: [[-0.1], [0.02], [0.001], [0]]\n")
+    (note,) = read_calibration(tmp_path / "a.yaml").notes
+    assert "4 coefficients and no model of the lens" in note and "fisheye" in note
+    (tmp_path / "a.yaml").write_text(PLAIN + "distortion_model: plumb_bob\nD: [-0.1, 0.02, 0.001, 0]\n")
+    assert read_calibration(tmp_path / "a.yaml").notes == ()
+
+
+def test_a_camera_is_shown_in_one_line():
+    camera = Camera("radtan", 48, 36, 42, 43, 23.5, 17.5, (-0.1, 0.02, 0, 0, 0))
+    assert camera_notes(camera) == ["camera: radtan 48 x 36, f 42 43, c 23.5 17.5, 5 coefficients"]
+    assert camera_notes(Camera("pinhole", 48, 36, 42, 43, 12, 26)) == [
+        "camera: pinhole 48 x 36, f 42 43, c 12 26, no distortion"
+    ]
+
+
+@pytest.mark.parametrize("centre", [(313, 233), (0, 0), (0.49, 0.486), (42, 17.5)])
+def test_a_principal_point_far_from_the_middle_is_suspicious(centre: tuple[float, float]):
+    notes = camera_notes(Camera("pinhole", 48, 36, 42, 43, *centre))
+    assert len(notes) == 2 and notes[1].startswith("suspicious: the principal point")
+
+
+def test_process_shows_the_camera_and_what_is_assumed_of_it(tmp_path: Path):
+    (tmp_path / "cam.yaml").write_text(PLAIN.replace("32.", "62.") + "D: [-0.1, 0.02, 0, 0]\n")
+    t_us = np.arange(0, 100_000, 100)
+    np.savez(tmp_path / "ev.npz", t=t_us, x=t_us // 100 % 64, y=t_us // 700 % 48, p=t_us // 300 % 2)
+    notes = process("auto", tmp_path / "ev.npz", tmp_path / "scene", ProcessSettings(camera=tmp_path / "cam.yaml"))
+    assert "camera: radtan 64 x 48, f 60 61, c 62 24, 4 coefficients" in notes
+    assert any(note.startswith("suspicious: the principal point 62 24") for note in notes)
+    assert any("4 coefficients and no model of the lens" in note for note in notes)

@@ -234,3 +234,82 @@ def test_columns_without_names_and_matrices_of_poses(tmp_path: Path):
             file[f"named/{role}"] = column
     assert "events in /named," in open_recording(tmp_path / "c.h5").format
     same(open_recording(tmp_path / "c.h5", part="raw"))
+
+
+def folder_of_npz(folder: Path, times: list[np.ndarray]) -> Path:
+    folder.mkdir()
+    for k, t in enumerate(times):
+        part = slice(k * len(t), (k + 1) * len(t))
+        rest = {name: column[part] for name, column in events().items() if name != "t"}
+        np.savez(folder / f"ev_{k}.npz", t=t, **rest)  # pyright: ignore[reportArgumentType]
+    return folder
+
+
+def test_files_that_count_from_their_own_start_are_not_laid_over_each_other(tmp_path: Path):
+    parts = np.split(events()["t"], 4)
+    with pytest.raises(RecordingError, match=r"ev_1.npz: times from 3 to .* ev_0.npz, 0 to .*from its own start\?"):
+        checked(open_recording(folder_of_npz(tmp_path / "anew", [t - t[0] + 3 * k for k, t in enumerate(parts)])), SIZE)
+    # Whole files out of order can be sorted.
+    backwards = open_recording(folder_of_npz(tmp_path / "backwards", parts[::-1]))
+    report = take_in(backwards, SIZE, Intake(unsorted="sort"), tmp_path / "out.h5")
+    assert report.kept == 400
+
+
+def test_files_in_different_units_are_an_error(tmp_path: Path):
+    parts: list[Any] = np.split(events()["t"], 4)
+    parts[2] = parts[2] * 1e-6
+    folder = folder_of_npz(tmp_path / "mixed", parts)
+    for unit in (None, "us"):
+        with pytest.raises(RecordingError, match="ev_2.npz: times are fractions, those of ev_1.npz integers"):
+            checked(open_recording(folder, time_unit=unit), SIZE)
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "place", "added_us", "words"),
+    [
+        (1, np.int64(70), "t_offset", 70, "/t_offset is added to the times, 70 us"),
+        (1, np.int64(70), "events/t_offset", 70, "/events/t_offset is added"),
+        (1e-6, np.float64(0.5), "t_offset", 500_000, "/t_offset is added to the times, 0.5 s"),
+        (1e-6, np.int64(500_000), "t_offset", 0, "/t_offset is 500000, in an unknown unit, and is not added"),
+        (1, np.zeros(2), "t_offset", 0, "/t_offset is not a time, and is not added"),
+    ],
+)
+def test_an_offset_is_in_the_unit_of_the_times(
+    tmp_path: Path, scale: float, offset: Any, place: str, added_us: int, words: str
+):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, column in events().items():
+            file[f"events/{name}"] = column * scale if name == "t" and scale != 1 else column
+        file[place] = offset
+    source = open_recording(tmp_path / "a.h5")
+    assert any(words in note for note in source.notes), source.notes
+    assert np.abs(checked(source, SIZE).t_us - events()["t"] - added_us).max() <= 1
+
+
+def test_an_offset_that_is_not_added_is_said(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", t_offset=70, **events())  # pyright: ignore[reportArgumentType]
+    source = open_recording(tmp_path / "a.npz")
+    assert source.notes == ("t_offset is 70, and is not added to the times; --time-offset-us does",)
+
+
+@pytest.mark.parametrize(("name", "said"), [("units", "ns"), ("time_unit", "nanoseconds since 1970"), ("unit", b"ns")])
+def test_attributes_give_the_unit_of_times(tmp_path: Path, name: str, said: Any):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for role, column in events().items():
+            file[f"events/{role}"] = 1000 * column if role == "t" else column
+        file["events/t"].attrs[name] = said
+    source = open_recording(tmp_path / "a.h5")
+    assert source.guessed_unit == "ns" and f"times in ns, as the attribute {name} says" in source.notes
+    same(source)
+
+
+def test_structs_within_structs_and_arrays_of_structs_of_matlab(tmp_path: Path):
+    t, x, y, p = (events()[role] for role in "txyp")
+    savemat(tmp_path / "a.mat", {"aedat": {"data": {"polarity": {"timeStamp": t, "x": x, "y": y, "polarity": p > 0}}}})
+    same(open_recording(tmp_path / "a.mat"))
+    rows = np.array(list(zip(t, x, y, p, strict=True)), [(name, object) for name in "txyp"])
+    savemat(tmp_path / "b.mat", {"events": rows})
+    same(open_recording(tmp_path / "b.mat"))
+    savemat(tmp_path / "c.mat", {"aedat": {"data": {"imu": {"timeStamp": t}, "frame": {"samples": x}}}})
+    with pytest.raises(RecordingError, match=r"arrays aedat\.data\.imu, aedat\.data\.frame, expected x, y"):
+        open_recording(tmp_path / "c.mat")

@@ -148,3 +148,25 @@ def test_a_crop_keeps_its_pixels_counted_from_its_corner(tmp_path: Path):
     assert report.left_out == {"events outside the crop": int((~inside).sum())}
     mirrored, _ = taken(tmp_path, events, crop=(0, 0, 24, 10), flip_y=True)
     assert np.array_equal(mirrored.y, (17 - whole.y)[whole.y >= 8])
+
+
+def test_pixels_counted_from_one_are_suspected_and_shifted(tmp_path: Path):
+    events: list[writers.Event] = [(7 * k, 1 + k % 24, 1 + k % 18, k % 2) for k in range(500)]
+    with pytest.raises(RecordingError, match=r"y of event 17 is 18.*: counted from 1\? Then use --one-based"):
+        taken(tmp_path, events)
+    back, report = taken(tmp_path, events, one_based=True)
+    assert back.x.tolist() == [k % 24 for k in range(500)] and back.y.tolist() == [k % 18 for k in range(500)]
+    inside = [event for event in events if event[1] < 24 and event[2] < 18]
+    _, report = taken(tmp_path, inside)
+    assert any("are pixels counted from 1? Then use --one-based" in note for note in report.notes)
+    for few in (inside[:9], [(0, 0, 5, 1), *inside]):
+        _, report = taken(tmp_path, few)
+        assert not report.notes
+    with pytest.raises(RecordingError, match="y of event 1 is 0, expected 1 or more with --one-based"):
+        taken(tmp_path, [(1, 1, 1, 1), (2, 1, 0, 1)], one_based=True)
+
+
+@pytest.mark.parametrize(("step_us", "words"), [(10_000, "10,000 us"), (250, ""), (300, "100 us"), (7, "")])
+def test_coarse_times_are_said(tmp_path: Path, step_us: int, words: str):
+    _, report = taken(tmp_path, [(5 + step_us * (k // 20), k % 24, k % 18, 1) for k in range(500)])
+    assert report.notes == ((f"times are multiples of {words}: rounded, or in another unit?",) if words else ())

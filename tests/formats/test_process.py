@@ -323,6 +323,14 @@ def test_a_window_between_two_poses_is_a_suspicion(tmp_path: Path):
     assert any("lie between keyframes 0 and 1, 8.33 ms apart: times in another unit?" in one for one in suspicions)
 
 
+def test_a_late_trajectory_is_said_to_leave_events_out(tmp_path: Path):
+    for sentences in odometry(tmp_path, "".join(poses("s").splitlines(keepends=True)[120:])):
+        assert any("50% of the events lie outside the trajectory's span" in sentence for sentence in sentences)
+    (tmp_path / "scene").rename(tmp_path / "late")
+    for sentences in odometry(tmp_path, poses("s")):
+        assert not any("outside the trajectory's span" in sentence for sentence in sentences)
+
+
 def test_a_discontinuous_trajectory_is_reported_and_suspected(tmp_path: Path):
     lines = [line.split() for line in poses("s").splitlines()]
     text = "".join(" ".join([t, f"{float(x) + 3 * (k > 99)}", *rest]) + "\n" for k, (t, x, *rest) in enumerate(lines))

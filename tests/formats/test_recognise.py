@@ -1,5 +1,6 @@
 """Formats are recognised from content, and all damage results in a one-line error."""
 
+import gzip
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from ebarf_ns.benchmarks.recordings import aedat4
 from ebarf_ns.errors import RecordingError
 from ebarf_ns.events.recording import Recording, read_recording
 from ebarf_ns.formats.intake import Intake, checked, take_in
-from ebarf_ns.formats.recognise import open_recording
+from ebarf_ns.formats.raw_inspection import inspect_recording
+from ebarf_ns.formats.recognise import open_recording, recognised
 from tests.conftest import DATA
 from tests.formats import writers
 
@@ -301,3 +303,30 @@ def test_a_cut_aedat4_is_an_error(tmp_path: Path):
             assert sum(map(len, open_recording(cut).pieces)) == 111_954
         except RecordingError as error:
             assert "cut.aedat4" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (gzip.compress(b"1 2 3 1"), "compressed by gzip, expected the file within"),
+        ("1 2 3 1".encode("utf-16"), "text in UTF-16, expected it in UTF-8"),
+        (b"#!AER-DAT2.0\r\n\0\1\2", "AEDAT 2, as jAER writes it, expected AEDAT 4"),
+    ],
+)
+def test_files_of_other_kinds_are_named(tmp_path: Path, content: bytes, words: str):
+    (tmp_path / "events").write_bytes(content)
+    with pytest.raises(RecordingError, match=words):
+        open_recording(tmp_path / "events")
+
+
+def test_text_below_comments_of_matlab_is_not_taken_for_prophesees(tmp_path: Path):
+    (tmp_path / "events.txt").write_text("% t x y p\n1 2 3 1\n")
+    assert recognised(tmp_path / "events.txt") == "text"
+    assert recognised(writers.dat(tmp_path / "events.dat", [(1, 2, 3, 1)])) == "dat"
+
+
+@pytest.mark.parametrize("p", [[0, 255], [1, 2], [-1, 0]])
+def test_inspection_refuses_polarities_that_processing_refuses(tmp_path: Path, p: list[int]):
+    np.savez(tmp_path / "a.npz", t=np.arange(40), x=np.arange(40) % 7, y=np.arange(40) % 5, p=np.tile(p, 20))
+    with pytest.raises(RecordingError, match="expected 0 .darker. and 1 .brighter., or -1 and 1"):
+        inspect_recording(lambda: open_recording(tmp_path / "a.npz"))

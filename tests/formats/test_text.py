@@ -10,6 +10,7 @@ from ebarf_ns.events.recording import Recording
 from ebarf_ns.formats.intake import checked
 from ebarf_ns.formats.readers import text
 from ebarf_ns.formats.readers.text import read_text
+from ebarf_ns.formats.recognise import open_recording
 from ebarf_ns.formats.source import TimeUnit
 
 WIDTH, HEIGHT = 240, 180
@@ -130,3 +131,73 @@ def test_fractions_of_guessed_microseconds_are_an_error(tmp_path: Path):
 def test_binary_rubbish_is_an_error(tmp_path: Path):
     with pytest.raises(RecordingError, match="events.txt"):
         read(tmp_path, bytes(range(256)))
+
+
+@pytest.mark.parametrize(
+    ("comment", "rows", "unit", "note"),
+    [
+        ("# t y x p", "{t} {y} {x} {p}", 1, "columns t y x p, as the comment in line 2 names them"),
+        ("# t[ns] x y p", "{t}000 {x} {y} {p}", 1, "columns t[ns] x y p, as the comment in line 2"),
+        ("# time in ms", "{t} {x} {y} {p}", 1000, "times in ms, as a comment says"),
+        ("# timestamps: unit is seconds", "{t} {x} {y} {p}", 10**6, "times in s, as a comment says"),
+        ("% events (ts,y,x,pol)", "{t} {y} {x} {p}", 1, "columns ts y x pol, as the comment"),
+        ("// extra x y p t", "9.9 {x} {y} {p} {t}", 1, "columns extra x y p t, as the comment"),
+        ("# a recording of t and x", "{t} {x} {y} {p}", 1, "that x is before y is assumed"),
+    ],
+)
+def test_comments_name_columns_and_units(tmp_path: Path, comment: str, rows: str, unit: int, note: str):
+    columns = [{"t": 7 * k, "x": k % 9, "y": 100 + k % 7, "p": k % 2} for k in range(20)]
+    lines = [rows.format(**event) for event in columns]
+    path = tmp_path / "events.txt"
+    path.write_text("\n".join(["# made by a program", comment, *lines]))
+    source = open_recording(path)
+    assert any(note in said for said in source.notes), source.notes
+    back = checked(source, (WIDTH, HEIGHT))
+    assert back.t_us.tolist() == [unit * event["t"] for event in columns]
+    assert back.x.tolist() == [event["x"] for event in columns]
+    assert back.y.tolist() == [event["y"] for event in columns]
+
+
+def test_a_comment_that_the_values_contradict_asks(tmp_path: Path):
+    path = tmp_path / "events.txt"
+    path.write_text("# t x y p\n" + "".join(f"{k % 9} {k % 7} {k % 2} {70 * k}\n" for k in range(200)))
+    with pytest.raises(RecordingError, match="comment names columns 't x y p', but the values read as 'x y p t'"):
+        read_text(path)
+    assert len(checked(read_text(path, columns="xypt"), (WIDTH, HEIGHT))) == 200
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "t,x,y,p\n5,1,2,True\n6,1,2,False\n",
+        "t,x,y,on\n5,1,2,ON\n6,1,2,OFF\n",
+        "5 1 2 true\n6 1 2 false\n",
+        '"t","x","y","p"\n"5","1","2","1"\n"6","1","2","0"\n',
+        ",t,x,y,p\n0,5,1,2,1\n1,6,1,2,0\n",
+        '"","t","x","y","p"\n"0",5,1,2,1\n"1",6,1,2,0\n',
+    ],
+)
+def test_words_quotes_and_indices(tmp_path: Path, content: str):
+    back = read(tmp_path, content, None)
+    assert back.t_us.tolist() == [5, 6] and back.x.tolist() == [1, 1] and back.polarity.tolist() == [1, -1]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            "t,x,y,p\n5,1,2,1\nnan,1,2,0\n",
+            ".txt:3: 'nan,1,2,0' is not an event, expected 't[us] x y p'; t[us] is 'nan'",
+        ),
+        ("t,x,y,p\n5,1,2,1\n6,1,2,up\n", "p is 'up', expected a whole number"),
+        ("t,x,y,p\n5,1,2,1\n" + "6,1,2,0\n" * 2000 + "6.5,1,2,1\n", "t has a fraction, --event-time-unit"),
+        ("0 5 1 2 1\n1 6 1 2 0\n", "columns: 5, expected 4; a first line may name them"),
+        ("5 1 2 1\n6 1", "columns: 2, expected 4; is the file cut off?"),
+        ("t;x;y;p\n0,5;1;2;1\n", "decimal commas?"),
+        ("5 1 2 1\n6 1 2 1e999\n", "a number is too long"),
+    ],
+)
+def test_what_is_wrong_with_a_line_is_said(tmp_path: Path, content: str, words: str):
+    with pytest.raises(RecordingError) as caught:
+        read(tmp_path, content, None)
+    assert words in str(caught.value) and ("--event-time-unit" in str(caught.value)) == ("fraction" in words)

@@ -166,6 +166,17 @@ def test_colmap_models(tmp_path: Path, binary: bool):
     assert "COLMAP" in notes[0] and "world-to-camera" in notes[0]
 
 
+def test_times_without_names_follow_the_numbers_of_images(tmp_path: Path):
+    lines = [
+        f"{k + 1} {' '.join(map(repr, pose.tolist()))} 1 frame_{k}.png\n" for k, (_, pose) in enumerate(colmap_images())
+    ]
+    (tmp_path / "images.txt").write_text("\n".join(sorted(lines)) + "\n")
+    (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
+    trajectory, notes = read_trajectory(tmp_path, TrajectoryFormat(pose_times=tmp_path / "times.txt"))
+    check(trajectory)
+    assert any(f"images from frame_0.png to frame_{COUNT - 1}.png in order" in note for note in notes)
+
+
 def test_llff(tmp_path: Path):
     llff = TURN * Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
     table = np.concatenate([matrices(llff), np.ones((COUNT, 3, 1))], axis=-1).reshape(COUNT, 15)
@@ -225,3 +236,33 @@ def test_real_estimates_in_both_spellings(name: str):
     assert np.allclose(plain.poses.position, original.poses.position, atol=1e-5)
     products = (plain.poses.quat_wxyz * original.poses.quat_wxyz).sum(-1).abs()
     assert float(products.min()) > 1 - 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("t.txt", tum("s").encode("utf-16"), "text in UTF-16, expected poses as text in UTF-8"),
+        ("poses.mat", b"MATLAB 5.0 MAT-file\x00\xff", "a MATLAB file, expected"),
+        ("events.bag", b"#ROSBAG V2.0\n\xff", "a ROS bag, expected"),
+        ("t.txt", b"\xe9\xe8", "not text in UTF-8, expected"),
+        ("transforms.json", b'{"fl_x": 42, "frames": []}', "as JSON or XML does, expected"),
+        ("poses.h5", b"nothing", "cannot be read .not a whole HDF5 file."),
+    ],
+)
+def test_other_kinds_of_files_are_named(tmp_path: Path, name: str, content: bytes, words: str):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(TrajectoryError, match=words):
+        read_trajectory(tmp_path / name)
+
+
+def test_arrays_of_other_names_are_listed(tmp_path: Path):
+    np.savez(tmp_path / "t.npz", poses=matrices(), t=T_US)
+    with pytest.raises(TrajectoryError, match=r"holds poses, t, expected T_wc_timestamp"):
+        read_trajectory(tmp_path / "t.npz")
+    with h5py.File(tmp_path / "t.h5", "w") as file:
+        file["davis/poses"] = matrices()
+    with pytest.raises(TrajectoryError, match=r"holds davis, expected Cn_T_C0 and ts"):
+        read_trajectory(tmp_path / "t.h5")
+    np.save(tmp_path / "t.npy", np.zeros(3, [("t", "i8"), ("x", "i2")]))
+    with pytest.raises(TrajectoryError, match=r"an array of t, x, expected numbers"):
+        read_trajectory(tmp_path / "t.npy")

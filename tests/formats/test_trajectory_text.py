@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ebarf_ns.errors import TrajectoryError
+from ebarf_ns.evaluation.compare import read_beside_reference
 from ebarf_ns.formats.trajectory_formats import TrajectoryFormat, read_trajectory
 from ebarf_ns.geometry.trajectory_file import read_tum
-from tests.formats.test_trajectory_formats import COUNT, POSITION, QUAT, T_US, check, matrices, rows, seconds, tum
+from tests.formats.test_trajectory_formats import COUNT, POSITION, QUAT, T_US, TURN, check, matrices, rows, seconds, tum
 
 WXYZ = QUAT[:, [3, 0, 1, 2]]
 NS = [str(1000 * t) for t in T_US.tolist()]
@@ -185,3 +186,101 @@ def test_frame_numbers_are_not_times_if_there_are_times(tmp_path: Path):
     (tmp_path / "poses.txt").write_text(lines)
     (tmp_path / "times.txt").write_text("\n".join(map(str, T_US)))
     check(read_trajectory(tmp_path / "poses.txt", TrajectoryFormat(pose_times=tmp_path / "times.txt"))[0])
+
+
+@pytest.mark.parametrize(
+    ("header", "pose"),
+    [
+        ("t,x,y,z,rw,rx,ry,rz", (POSITION, WXYZ)),
+        ("Time,RW,RX,RY,RZ,TX,TY,TZ", (WXYZ, POSITION)),
+        ("timestamp,x,y,z,w,i,j,k", (POSITION, WXYZ)),
+        ("time,pos.x,pos.y,pos.z,ori.w,ori.x,ori.y,ori.z", (POSITION, WXYZ)),
+        ("time,px,py,pz,q_real,q_i,q_j,q_k", (POSITION, WXYZ)),
+        ("time,p[0],p[1],p[2],quat_i,quat_j,quat_k,quat_scalar", (POSITION, QUAT)),
+        ("Zeit,X,Y,Z,QW,QX,QY,QZ", (POSITION, WXYZ)),
+        ("# format: timestamp position quaternion(w,x,y,z)", (POSITION, WXYZ)),
+        ("# t x y z w x y z", (POSITION, WXYZ)),
+        ("# t x y z x y z w", (POSITION, QUAT)),
+        ("# quaternion is scalar first, Hamilton", (POSITION, WXYZ)),
+        ("# the quaternion has w last", (POSITION, QUAT)),
+        ("# made by a program of mine that day", (POSITION, QUAT)),
+    ],
+)
+def test_the_order_of_a_quaternion_is_read_in_many_words(tmp_path: Path, header: str, pose: tuple[np.ndarray, ...]):
+    (tmp_path / "t.csv").write_text(table(header, seconds(T_US), *pose))
+    check(read_trajectory(tmp_path / "t.csv")[0])
+
+
+@pytest.mark.parametrize(
+    ("header", "named"),
+    [
+        ("time,X,Y,Z,q0,q1,q2,q3", "q0, q1, q2, q3"),
+        ("t,x,y,z,q1,q2,q3,q4", "q1, q2, q3, q4"),
+        ("# t x y z q1 q2 q3 q4", "q1, q2, q3, q4"),
+        ("t,x,y,z,a,b,c,d", "a, b, c, d"),
+        ("when,a,b,c,d,e,f,g", "d, e, f, g"),
+        ("# w first, formerly x y z w", "'w first' and 'x y z w'"),
+    ],
+)
+def test_an_order_that_names_do_not_tell_is_asked_for(tmp_path: Path, header: str, named: str):
+    (tmp_path / "t.csv").write_text(table(header, seconds(T_US), POSITION, WXYZ))
+    with pytest.raises(TrajectoryError, match=f"{named}.*expected --quaternion"):
+        read_trajectory(tmp_path / "t.csv")
+    check(read_trajectory(tmp_path / "t.csv", TrajectoryFormat(quaternion="wxyz"))[0])
+
+
+def test_a_reference_tells_the_order_that_names_do_not(tmp_path: Path):
+    (tmp_path / "t.csv").write_text(table("t,x,y,z,q0,q1,q2,q3", seconds(T_US), POSITION, WXYZ))
+    (tmp_path / "reference.txt").write_text(tum("s"))
+    reference, _ = read_trajectory(tmp_path / "reference.txt")
+    check(read_beside_reference(tmp_path / "t.csv", reference)[0])
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t,north,east,down,qx,qy,qz,qw", "columns north, east, down are not understood, expected names such as t, x"),
+        ("t,x,y,z,roll,pitch,yaw,valid", "columns roll, pitch, yaw, valid are not understood.* angles are not read"),
+    ],
+)
+def test_columns_that_are_no_pose_are_named(tmp_path: Path, header: str, words: str):
+    (tmp_path / "t.csv").write_text(table(header, seconds(T_US), POSITION, QUAT))
+    with pytest.raises(TrajectoryError, match=words):
+        read_trajectory(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize(
+    ("header", "before"), [("exposure [ms],time [s]", "10"), ("latency [us],timestamp", "10"), ("n [],t [s]", "1")]
+)
+def test_the_unit_of_time_is_that_in_its_own_brackets(tmp_path: Path, header: str, before: str):
+    text = table(f"{header},x [m],y [m],z [m],qx,qy,qz,qw", before, seconds(T_US), POSITION, QUAT)
+    (tmp_path / "t.csv").write_text(text)
+    trajectory, notes = read_trajectory(tmp_path / "t.csv")
+    check(trajectory)
+    assert "times in s" in notes[0]
+
+
+@pytest.mark.parametrize("comment", ["world to camera (T_cw)", "poses are w2c", "camera from world"])
+def test_comments_tell_the_direction_of_poses(tmp_path: Path, comment: str):
+    inverse = TURN.inv()
+    poses = np.hstack([-inverse.apply(POSITION), inverse.as_quat()])
+    (tmp_path / "t.txt").write_text(f"# {comment}\n# timestamp tx ty tz qx qy qz qw\n" + rows(seconds(T_US), poses))
+    trajectory, notes = read_trajectory(tmp_path / "t.txt")
+    check(trajectory)
+    assert any("as its comments say" in note for note in notes)
+    (tmp_path / "both.txt").write_text(f"# {comment}, not c2w\n" + rows(seconds(T_US), poses))
+    with pytest.raises(TrajectoryError, match="say both .* expected --transform"):
+        read_trajectory(tmp_path / "both.txt")
+    check(read_trajectory(tmp_path / "both.txt", TrajectoryFormat(transform="world-to-camera"))[0])
+
+
+def test_decimal_commas_between_blanks_are_named(tmp_path: Path):
+    (tmp_path / "t.txt").write_text(tum("s").replace(".", ","))
+    with pytest.raises(TrajectoryError, match=r"t\.txt:1: .* has a decimal comma"):
+        read_trajectory(tmp_path / "t.txt")
+
+
+def test_a_repeated_time_is_shown_as_it_is_written(tmp_path: Path):
+    (tmp_path / "t.txt").write_text(2 * rows([f"{0.05 * k:.9f}" for k in range(COUNT)], np.hstack([POSITION, QUAT])))
+    with pytest.raises(TrajectoryError, match=r"time 0\.000000000 again, as in line 1"):
+        read_trajectory(tmp_path / "t.txt")

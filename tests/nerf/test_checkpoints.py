@@ -14,7 +14,7 @@ import torch
 
 from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.checkpoints import checksum, newest_whole, read_checkpoint, sealed, unsealed, write_checkpoint
-from ebarf_ns.nerf.run_folder import take_folder
+from ebarf_ns.nerf.run_folder import remove_checkpoints, take_folder
 from tests.nerf.test_training import config, trainer
 
 
@@ -149,6 +149,8 @@ def test_a_folder_has_one_writer_and_loses_what_a_killed_one_left_half_written(t
     take_folder(tmp_path, goes_on=True, overwrite=False).release()
     assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "config.yml", "nerfstudio_models"]
     take_folder(tmp_path, goes_on=False, overwrite=True).release()
+    assert step_path(tmp_path, 1).is_file()
+    remove_checkpoints(tmp_path)
     assert not list(step_path(tmp_path, 1).parent.iterdir())
 
 
@@ -193,7 +195,7 @@ def test_a_signal_in_any_phase_ends_a_run_in_order(
     assert json.loads((tmp_path / "x/ebarf/run/metrics.jsonl").read_text().splitlines()[-1])["step"] == 31
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_a_run_whole(
     tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: int
 ):

@@ -58,7 +58,8 @@ def test_nothing_is_run_that_the_file_names(hostile: str, tmp_path: Path):
     [
         ("", "holds a NoneType"),
         ("[1, 2]", "holds a list"),
-        ("!!python/object:ebarf_ns.nerf.model.EbarfModelConfig {}", "holds a EbarfModelConfig"),
+        ("!!python/object:ebarf_ns.nerf.model.EbarfModelConfig {}", "has a target of another configuration"),
+        ("!!python/name:ebarf_ns.nerf.model.EbarfModelConfig ''", "holds a type"),
         ("a: [", "cannot be read"),
         ("[" * 5000, "cannot be read"),
         ("\x00", "cannot be read"),

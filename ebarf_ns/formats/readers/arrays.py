@@ -31,10 +31,12 @@ from ebarf_ns.formats.columns import (
     spaced,
     unit_of,
 )
+from ebarf_ns.formats.readers.mat_elements import check_elements
 from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds, numbered
 
 _EVENTS_AT_ONCE = 1 << 20
 _ESIM = "xytp"
+_FEW_ROWS = 8
 Arrays = Mapping[str, Any]
 """Arrays of a file, or mappings for structs, by name."""
 
@@ -48,6 +50,8 @@ class _Found:
     """Unit of the times, if a name gives it."""
     order: str | None = "xytp"
     """None: not known yet."""
+    offset: str = ""
+    """An offset of the times beside them, as text."""
 
     def by_role(self, order: str) -> tuple[np.ndarray, ...]:
         """x, y, t and p, with ``order`` for unnamed columns."""
@@ -110,10 +114,18 @@ def _read(
     t = replace(first, columns=tuple(samples)).by_role(order)[2]
     unit = time_unit or first.unit or ("ns" if kind == "npy" and order == _ESIM and _of_esim(t) else guessed_unit(t))
     notes += coarseness(t, unit)
+    if first.offset:
+        notes.append(f"t_offset is {first.offset}, and is not added to the times; --time-offset-us does")
     name = f"{kind if len(files) == 1 else f'{len(files)} {kind} files'}, times in {unit}"
     guess = None if time_unit or first.unit else unit
     return Source(
-        path, name, None, _pieces(files, opened, order, unit), notes=tuple(notes), guessed_unit=guess, columns=order
+        path,
+        name,
+        None,
+        _pieces(files, opened, order, unit, guess is None),
+        notes=tuple(notes),
+        guessed_unit=guess,
+        columns=order,
     )
 
 
@@ -171,7 +183,9 @@ def _by_names(path: Path, arrays: Arrays) -> _Found | None:
     lengths = [column.shape for column in columns]
     if len({*lengths}) != 1 or columns[0].ndim != 1:
         raise RecordingError(f"{path}: columns of shapes {lengths}, expected one row per event")
-    return _Found(columns, "ns" if robust else unit_of(names["t"]))
+    offset = np.asarray(arrays["t_offset"]) if "t_offset" in arrays else np.zeros(1)
+    said = f"{offset.item()}" if offset.size == 1 and offset.item() else ""
+    return _Found(columns, "ns" if robust else unit_of(names["t"]), offset=said)
 
 
 def _without_names(arrays: Arrays) -> _Found | None:
@@ -240,8 +254,14 @@ def _npy(path: Path) -> Iterator[Arrays]:
 @contextmanager
 def _mat(path: Path) -> Iterator[Arrays]:
     try:
+        check_elements(path.read_bytes())
         variables = loadmat(path)
-        arrays = {name: _unwrapped(value) for name, value in variables.items() if not name.startswith("__")}
+        arrays = {
+            inner: array
+            for name, value in variables.items()
+            if not name.startswith("__")
+            for inner, array in _parts(name, _unwrapped(value))
+        }
     except Exception as error:
         # A damaged file can raise any exception.
         raise RecordingError(f"{path}: not a whole MATLAB 5 file ({type(error).__name__}: {error})") from None
@@ -249,19 +269,65 @@ def _mat(path: Path) -> Iterator[Arrays]:
 
 
 def _unwrapped(value: Any) -> Any:
-    """Convert a struct of arrays to a mapping."""
-    if getattr(value, "dtype", None) is not None and value.dtype.names and value.size == 1:
-        return {name: value[name].item() for name in value.dtype.names}
+    """Convert a struct to a mapping, and an array of structs with a number in each field to a mapping of arrays."""
+    if getattr(value, "dtype", None) is None or not value.dtype.names:
+        return np.asarray(value)
+    if value.size == 1:
+        return {name: _unwrapped(value[name].item()) for name in value.dtype.names}
+    fields = {name: value[name].reshape(-1) for name in value.dtype.names}
+    if all(np.size(one) == 1 for field in fields.values() for one in field):
+        return {name: np.array([np.asarray(one).item() for one in field]) for name, field in fields.items()}
     return np.asarray(value)
 
 
-def _pieces(files: list[Path], opened: Callable[[Path], _Found], order: str, unit: TimeUnit) -> Iterator[Piece]:
+def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """A variable, and the structs within it by dotted names."""
+    fields = value.items() if isinstance(value, Mapping) else ()
+    structs = {inner: one for inner, one in fields if isinstance(one, Mapping)}
+    if not structs or len(structs) < len(fields):
+        yield name, value
+    for inner, one in structs.items():
+        yield from _parts(f"{name}.{inner}", one)
+
+
+def _pieces(
+    files: list[Path], opened: Callable[[Path], _Found], order: str, unit: TimeUnit, stated: bool
+) -> Iterator[Piece]:
+    before = None
     for path in files:
-        columns = opened(path).by_role(order)
+        found = opened(path)
+        columns = found.by_role(order)
+        if len(columns[2]) >= _FEW_ROWS:
+            if before:
+                _check_beside(path, columns[2], found.unit, before, stated)
+            before = path.name, columns[2], found.unit
         for first in range(0, len(columns[0]), _EVENTS_AT_ONCE):
             x, y, t, p = (column[first : first + _EVENTS_AT_ONCE] for column in columns)
             x, y, p = (integers(path, column, name, first) for name, column in (("x", x), ("y", y), ("p", p)))
             yield Piece(x, y, _microseconds(path, t, unit, first), p, numbered(first, f"{path.name} row"))
+
+
+def _check_beside(
+    path: Path, t: np.ndarray, unit: TimeUnit | None, before: tuple[str, np.ndarray, TimeUnit | None], stated: bool
+) -> None:
+    """Raise :class:`RecordingError` for a file in another unit than the one before, or that counts from its start."""
+    other, earlier, its_unit = before
+    kinds = ["integers" if is_whole(column) else "fractions" for column in (t, earlier)]
+    if unit != its_unit:
+        kinds = [f"in {unit or 'no unit'}", f"in {its_unit or 'no unit'}"]
+    elif stated and t.dtype.kind == earlier.dtype.kind:
+        kinds = []
+    if len({*kinds}) > 1:
+        raise RecordingError(
+            f"{path}: times are {kinds[0]}, those of {other} {kinds[1]}; expected one unit of time in all files"
+        )
+    # Whole files out of order can be sorted; those that count from their own start cannot.
+    (start, end), (its_start, its_end) = ((float(column[0]), float(column[-1])) for column in (t, earlier))
+    if 2 * (min(end, its_end) - max(start, its_start)) > min(end - start, its_end - its_start):
+        raise RecordingError(
+            f"{path}: times from {t[0]} to {t[-1]} lie over those of {other}, {earlier[0]} to {earlier[-1]}: does each "
+            "file count from its own start? Expected times that go on from file to file"
+        )
 
 
 def _microseconds(path: Path, t: np.ndarray, unit: TimeUnit, first: int) -> np.ndarray:

@@ -28,6 +28,7 @@ from ebarf_ns.formats.columns import (
     sampled,
     spaced,
     unit_of,
+    worded_unit,
 )
 from ebarf_ns.formats.readers import ecf
 from ebarf_ns.formats.source import Piece, Source, TimeUnit, fits, microseconds, numbered
@@ -39,6 +40,7 @@ _EVENTS_AT_ONCE = 1 << 20
 # Exceptions of the library for damaged files.
 _DAMAGES = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
 _USUAL = "txyp"
+_UNIT_ATTRIBUTES = ("unit", "units", "time_unit", "time_units")
 
 
 @dataclass(frozen=True)
@@ -85,9 +87,9 @@ def read_hdf5(
 ) -> Source:
     """Read the events of ``group``, by default the only one with events; raises :class:`RecordingError`.
 
-    Unless ``time_unit`` is given, times are in the unit of their name, as in ``t_ns``, else microseconds if integer and
-    seconds if not; ``t_offset`` and Prophesee's compressed tables are in microseconds. ``columns`` is the order of
-    unnamed columns.
+    Unless ``time_unit`` is given, times are in the unit of their name, as in ``t_ns``, or of their attribute, else
+    microseconds if integer and seconds if not; ``t_offset`` is in the same unit. Prophesee's compressed tables are in
+    microseconds. ``columns`` is the order of unnamed columns.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -96,13 +98,15 @@ def read_hdf5(
             events = _events_of(file[name] if name else file)  # pyright: ignore[reportArgumentType]
             assert events is not None
             order, unit, notes = _order_and_unit(path, name, events, time_unit, columns)
+            offset_us, said_offset = _offset(file, name, events.by_role(order)["t"], unit)
     except _DAMAGES as error:
         raise RecordingError(f"{path}: not a whole HDF5 file ({_one_line(error)})") from None
     guess = None if time_unit or unit_of(events.time_name) else unit
     said = f"HDF5, events in /{name}, times in {unit}"
     return Source(
-        path, said, size, _pieces(path, name, order, unit), notes=tuple(notes), guessed_unit=guess, columns=order
-    )
+        path, said, size, _pieces(path, name, order, unit, offset_us), notes=(*notes, *said_offset),
+        guessed_unit=guess, columns=order,
+    )  # fmt: skip
 
 
 def _order_and_unit(
@@ -116,8 +120,32 @@ def _order_and_unit(
     _check(path, name, events.by_role(order))
     time = events.by_role(order)["t"]
     t = sampled([time])[0] if time.dtype.kind == "f" else np.zeros(0, np.int64)
-    unit = time_unit or unit_of(events.time_name) or guessed_unit(t)
+    unit = time_unit or unit_of(events.time_name)
+    if unit is None and (key := _unit_attribute(time.data)):
+        unit = worded_unit(time.data.attrs[key])
+        notes.append(f"times in {unit}, as the attribute {key} says")
+    unit = unit or guessed_unit(t)
     return order, unit, notes + coarseness(t, unit)
+
+
+def _unit_attribute(data: h5py.Dataset) -> str | None:
+    """Name of a dataset's attribute with the unit of its times, if that unit is known."""
+    return next((key for key in data.attrs if key.lower() in _UNIT_ATTRIBUTES and worded_unit(data.attrs[key])), None)
+
+
+def _offset(file: h5py.File, name: str, time: _Column, unit: TimeUnit) -> tuple[int, list[str]]:
+    """The offset of all times in microseconds, beside the columns or at top level, with a note."""
+    beside = f"{name}/t_offset" if name and isinstance(file[name], h5py.Group) else "t_offset"
+    found = next((key for key in (beside, "t_offset") if key in file), None)
+    value = np.asarray(file[found]).reshape(-1) if found else np.zeros(1)
+    if len(value) != 1 or value.dtype.kind not in "iuf" or not fits(value, unit).all():
+        return 0, [f"/{found} is not a time, and is not added to the times"]
+    if not value[0]:
+        return 0, []
+    # An integer beside times in seconds may be in microseconds.
+    if unit != "us" and time.dtype.kind == "f" and value.dtype.kind != "f":
+        return 0, [f"/{found} is {value[0]}, in an unknown unit, and is not added to the times; --time-offset-us does"]
+    return int(microseconds(value, unit)[0]), [f"/{found} is added to the times, {value[0]} {unit}"]
 
 
 def _groups(file: h5py.File, wanted: str | None) -> dict[str, _Events]:
@@ -204,13 +232,12 @@ def _sensor_size(file: h5py.File, name: str) -> tuple[int, int] | None:
     return None
 
 
-def _pieces(path: Path, group: str, order: str, unit: TimeUnit) -> Iterator[Piece]:
+def _pieces(path: Path, group: str, order: str, unit: TimeUnit, offset_us: int) -> Iterator[Piece]:
     try:
         with h5py.File(path, "r") as file:
             events = _events_of(file[group] if group else file)  # pyright: ignore[reportArgumentType]
             assert events is not None
             columns = events.by_role(order)
-            offset_us = int(np.asarray(file["t_offset"]).item()) if "t_offset" in file else 0
             if _is_ecf(columns["t"].data):
                 yield from _ecf_pieces(columns["t"].data, offset_us)
                 return

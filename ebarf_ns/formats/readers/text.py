@@ -1,170 +1,95 @@
 """Events as text, one per line: exact decimal times, every malformed line reported.
 
-``t x y p`` in any order, given by a header line or inferred from the values, separated by blanks, commas or semicolons;
-a first line ``width height`` is rpg_e2vid's. Numbers may have decimal points and exponents, as written by
-``numpy.savetxt``.
+``t x y p`` in any order, given by a header line or a comment, or inferred from the values, separated by blanks, commas
+or semicolons; a first line ``width height`` is rpg_e2vid's. Numbers may have quotes, decimal points and exponents, as
+written by ``numpy.savetxt``; polarities may be words. Comments begin with ``#``, ``%`` or ``//``.
 """
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterator
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ebarf_ns.compiled import njit
 from ebarf_ns.errors import RecordingError
-from ebarf_ns.formats.columns import ROLES, UNITS, coarseness, guessed_unit, inferred_order, spaced
+from ebarf_ns.formats.readers.text_header import POLARITY, TIME, UNUSED, WORDS, Layout, X, Y, decimal, layout_of
 from ebarf_ns.formats.source import DECIMALS, Piece, Source, TimeUnit
 
 _BLOCK_BYTES = 1 << 22
-_TIME, _X, _Y, _POLARITY, _LINE, _TABLE = range(6)
-_ROLES = {
-    "t": _TIME, "ts": _TIME, "time": _TIME, "times": _TIME, "timestamp": _TIME, "timestamps": _TIME, "x": _X, "xs": _X,
-    "y": _Y, "ys": _Y, "p": _POLARITY, "ps": _POLARITY, "pol": _POLARITY, "polarity": _POLARITY,
-    "polarities": _POLARITY, "on": _POLARITY,
-}  # fmt: skip
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _SIGNIFICANT = 18  # digits that fit int64
-_UNUSED = -1
-
-
-class _Layout(NamedTuple):
-    roles: tuple[int, ...]
-    """Role of each column."""
-    unit: TimeUnit
-    guessed: bool
-    """Whether the unit was only guessed from the first times."""
-    sensor_size: tuple[int, int] | None
-    header_lines: int
-    order: str
-    """Order of unnamed columns, one letter each."""
-    notes: tuple[str, ...]
+_LINE, _TABLE = 4, 5
 
 
 def read_text(path: Path, time_unit: TimeUnit | None = None, columns: str | None = None) -> Source:
-    """Read events; the column order comes from a header, ``columns`` or the values, and is usually ``t x y p``.
+    """Read events; the column order comes from a header, ``columns``, a comment or the values; usually ``t x y p``.
 
-    Unless their name or ``time_unit`` gives a unit, times are seconds if the first ones have fractions, else
+    Unless their name, a comment or ``time_unit`` gives a unit, times are seconds if the first ones have fractions, else
     microseconds.
     Raises :class:`RecordingError` with file, line, text and expectation; nothing is repaired or dropped.
     """
-    layout = _layout(path, time_unit, columns)
+    layout = layout_of(path, time_unit, columns)
     name = f"text, times in {layout.unit}"
-    guess = layout.unit if layout.guessed else None
+    guess = layout.unit if layout.doubtful else None
     return Source(
         path, name, layout.sensor_size, _pieces(path, layout), notes=layout.notes, guessed_unit=guess,
         columns=layout.order,
     )  # fmt: skip
 
 
-def _layout(path: Path, time_unit: TimeUnit | None, columns: str | None) -> _Layout:
-    """Infer the layout from the first lines."""
-    size, roles, unit = None, None, None
-    lines = list(_first_lines(path))
-    for place, (number, fields) in enumerate(lines):
-        numeric = [_decimal(field) for field in fields]
-        if None in numeric and roles is None:
-            roles, unit = _named_columns(path, number, fields, time_unit)
-            continue
-        if len(fields) == 2 and size is None and None not in numeric:
-            size = int(numeric[0] or 0), int(numeric[1] or 0)
-            continue
-        order, notes = "", ()
-        if roles is None:
-            order, notes = _inferred_order(path, [fields for _, fields in lines[place:]], columns)
-            roles = tuple(ROLES.index(role) for role in order)
-        column = roles.index(_TIME)
-        times = [fields[column] for _, fields in lines[place:] if column < len(fields)]
-        stated, unit = time_unit or unit, time_unit or unit or _guessed(times)
-        numbers = [number for number in map(_decimal, times) if number is not None]
-        notes += tuple(coarseness(np.array(numbers, float), unit))
-        return _Layout(roles, unit, stated is None, size, number - 1, order, notes)
-    raise RecordingError(f"{path}: holds no events, expected lines 't[s] x y p'")
-
-
-def _inferred_order(path: Path, rows: list[list[str]], columns: str | None) -> tuple[str, tuple[str, ...]]:
-    """The order of unnamed columns, and a note on how it was found."""
-    if columns:
-        return columns, (f"columns {spaced(columns)}, as stated",)
-    numbers = [[_decimal(field) for field in fields] for fields in rows]
-    whole = list(itertools.takewhile(lambda row: len(row) == len(ROLES) and None not in row, numbers))
-    order, how = inferred_order(path, list(np.array(whole, float).reshape(-1, len(ROLES)).T), ROLES)
-    return order, (f"columns {spaced(order)}, {how}",)
-
-
-def _guessed(times: list[str]) -> TimeUnit:
-    """Unit guessed from the first times, see :func:`read_text`."""
-    numbers = [_decimal(time) for time in times]
-    if not any(re.search("[.eE]", time) for time in times):
-        return "us"
-    return guessed_unit(np.array(numbers, float)) if None not in numbers else "s"
-
-
-def _first_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    try:
-        with path.open("rb") as file:
-            for number in range(1, 1000):
-                line = file.readline(1 << 16)
-                if not line:
-                    return
-                text = line.decode("utf-8-sig", errors="replace").split("#")[0].strip(" \t\r\n,;")
-                # Join a unit with its name: "time (us)".
-                fields = re.split(r"[\s,;]+", re.sub(r"\s+(?=[\[(])", "", text))
-                if fields != [""]:
-                    yield number, fields
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror or error}") from None
-
-
-def _decimal(text: str) -> Decimal | None:
-    try:
-        number = Decimal(text)
-    except InvalidOperation:
-        return None
-    return number if number.is_finite() else None
-
-
-def _named_columns(
-    path: Path, number: int, fields: list[str], time_unit: TimeUnit | None
-) -> tuple[tuple[int, ...], TimeUnit | None]:
-    unit = time_unit
-    roles = []
-    for field in fields:
-        name, _, of = field.lower().strip("\"'").replace("[", "_").rstrip("])").replace("(", "_").partition("_")
-        role = _ROLES.get(name, _UNUSED)
-        if role == _TIME and time_unit is None:
-            unit = UNITS.get(of)
-            if unit is None and re.search(r"[\[(].*\w", field):
-                expected = f"one of {', '.join(UNITS)}, or --event-time-unit"
-                raise RecordingError(f"{path}:{number}: times in {of!r:.20}, expected {expected}")
-        roles.append(role)
-    if sorted(role for role in roles if role != _UNUSED) != [_TIME, _X, _Y, _POLARITY]:
-        raise RecordingError(f"{path}:{number}: columns {' '.join(fields)!r:.60}, expected t, x, y and p once each")
-    return tuple(roles), unit
-
-
-def _pieces(path: Path, layout: _Layout) -> Iterator[Piece]:
+def _pieces(path: Path, layout: Layout) -> Iterator[Piece]:
     roles = np.array(layout.roles)
     for block, line in _line_blocks(path, layout.header_lines):
-        content = np.frombuffer(block, np.uint8)
         # A fractional time contradicts guessed microseconds.
         exact = layout.guessed and layout.unit == "us"
-        table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], not exact, block.count(b"\n") + 1)
+        plain = _plain(block, layout.words)
+        content = np.frombuffer(plain, np.uint8)
+        table, bad_line = _parse(content, line, roles, DECIMALS[layout.unit], not exact, plain.count(b"\n") + 1)
         if bad_line:
-            text = block.split(b"\n")[bad_line - line].decode(errors="replace").strip()
-            columns = {_TIME: f"t[{layout.unit}]", _X: "x", _Y: "y", _POLARITY: "p", _UNUSED: "-"}
-            names = " ".join(columns[role] for role in layout.roles)
-            hint = ", or --event-time-unit" if exact else ""
-            hint += ", or --event-columns" if layout.order else ""
-            raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'{hint}")
+            lines = block.decode(errors="replace").split("\n")
+            text = lines[bad_line - line].strip()
+            names = " ".join(_name(role, layout.unit) for role in layout.roles)
+            why = _why_not(text, layout, exact) + "; is the file cut off?" * (bad_line - line == len(lines) - 1)
+            raise RecordingError(f"{path}:{bad_line}: {text!r:.60} is not an event, expected '{names}'; {why}")
         if len(table):
             t_us, x, y, polarity, lines = table.T
             yield Piece(x, y, np.ascontiguousarray(t_us), polarity, lambda k, lines=lines: f"line {lines[k]:,}")
+
+
+def _plain(block: bytes, words: bool) -> bytes:
+    """The same lines without quotes, and with numbers instead of words."""
+    block = block.replace(b'"', b"") if b'"' in block else block
+    if not words:
+        return block
+    return re.sub(rb"[A-Za-z]+", lambda word: WORDS.get(word[0].decode().lower(), word[0].decode()).encode(), block)
+
+
+def _name(role: int, unit: TimeUnit) -> str:
+    return {TIME: f"t[{unit}]", X: "x", Y: "y", POLARITY: "p"}.get(role, "-")
+
+
+def _why_not(text: str, layout: Layout, exact: bool) -> str:
+    """What is wrong with a line."""
+    fields = [field for field in re.split(r"[\s,;]+", re.split("#|%|//", text.replace('"', ""))[0]) if field]
+    if len(fields) != len(layout.roles):
+        many = len(fields) > len(layout.roles)
+        hint = "; a first line may name them, as in 't x y p other'" if many and layout.order else ""
+        hint = "; decimal commas? Expected points" if many and ";" in text and "," in text else hint
+        return f"columns: {len(fields)}, expected {len(layout.roles)}{hint}"
+    for field, role in zip(fields, layout.roles, strict=True):
+        number = decimal(WORDS.get(field.lower(), field) if layout.words else field)
+        whole = number is not None and number == number.to_integral_value()
+        if role == UNUSED or (number is not None and role == TIME and (whole or not exact)):
+            continue
+        if role == TIME and number is not None:
+            return "t has a fraction, --event-time-unit gives its unit"
+        if number is None or not whole or (number < 0 and role != POLARITY):
+            expected = ("a number" if role == TIME else "a whole number") + ", or --event-columns" * bool(layout.order)
+            return f"{_name(role, layout.unit)} is {field!r:.20}, expected {expected}"
+    return "a number is too long"
 
 
 def _line_blocks(path: Path, header_lines: int) -> Iterator[tuple[bytes, int]]:
@@ -194,7 +119,7 @@ def _parse(content, first_line, roles, time_decimals, round_times, most):
         column, comment = 0, False
         while i < len(content) and content[i] != 10:
             c = content[i]
-            if c == 35:  # '#'
+            if c == 35 or c == 37 or (c == 47 and i + 1 < len(content) and content[i + 1] == 47):  # '#', '%', '//'
                 comment = True
             if comment or c == 32 or c == 9 or c == 13 or c == 44 or c == 59:
                 i += 1
@@ -202,9 +127,9 @@ def _parse(content, first_line, roles, time_decimals, round_times, most):
             if column >= len(roles):
                 return table[:count], line
             role = roles[column]
-            value, i, ok = _number(content, i, time_decimals if role == _TIME else 0, role == _TIME and round_times)
-            if role != _UNUSED:
-                if not ok or (value < 0 and (role == _X or role == _Y)):
+            value, i, ok = _number(content, i, time_decimals if role == TIME else 0, role == TIME and round_times)
+            if role != UNUSED:
+                if not ok or (value < 0 and (role == X or role == Y)):
                     return table[:count], line
                 table[count, role] = value
             column += 1
