@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from ebarf_ns.geometry.trajectory import Trajectory
 
 FORMAT, VERSION = "ebarf-scene", 1
-# A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
 _LARGE_SHARE = 0.05
+# A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
 _LONGEST_SPAN_RATIO = 100
 _LONGEST_REFRACTORY_US = 1_000_000
 _LONGEST_TIME_CONSTANT_US = 1_000_000

@@ -24,6 +24,8 @@ with suppress(ImportError):
 # Also the longest recording that gets a ms_to_idx table: about 6 days.
 _MAX_SPAN_US = 1 << 39
 _MAX_TIME_US = 1 << 61
+# No compression of events comes near it.
+_MOST_COMPRESSED = 1_000_000
 _CHUNK = 1 << 17
 
 
@@ -123,7 +125,10 @@ class RecordingFile:
                     )
                 if not lengths["t"]:
                     raise RecordingError(f"{path}: /events is empty, expected at least one event")
-                t_offset_us = int(np.asarray(file["t_offset"])) if "t_offset" in file else 0
+                for name, column in columns.items():
+                    if not is_stored(column):
+                        raise RecordingError(f"{path}: /events/{name} declares {len(column):,} events and stores none")
+                t_offset_us = self._offset_us(file)
                 if abs(t_offset_us) > _MAX_TIME_US:
                     raise RecordingError(f"{path}: /t_offset is {t_offset_us}, expected within ±{_MAX_TIME_US} us")
                 yield columns, t_offset_us
@@ -131,6 +136,14 @@ class RecordingFile:
             missing = "no such file, expected the recording"
             reason = missing if not path.exists() else f"not a readable HDF5 file ({error})"
             raise RecordingError(f"{path}: {reason}") from None
+
+    def _offset_us(self, file: h5py.File) -> int:
+        offset = file.get("t_offset")
+        if offset is None:
+            return 0
+        if not isinstance(offset, h5py.Dataset) or offset.size != 1 or offset.dtype.kind not in "iu":
+            raise RecordingError(f"{self.path}: /t_offset is not one integer, expected a time in microseconds")
+        return int(np.asarray(offset).item())
 
     def _column(self, file: h5py.File, name: str) -> h5py.Dataset:
         dataset = file.get(f"events/{name}")
@@ -207,6 +220,12 @@ def write_recording(path: Path, pieces: Iterable[Recording], source: Path | None
             raise RecordingError(f"{source or path}: no event is left, expected some")
         _append(columns["ms_to_idx"], np.array([count]))
         file["t_offset"] = np.int64(offset_us)
+
+
+def is_stored(dataset: h5py.Dataset) -> bool:
+    """Whether a file can hold what a dataset declares: chunks that were never written cost nothing."""
+    declared = len(dataset) * dataset.dtype.itemsize
+    return dataset.is_virtual or declared <= _MOST_COMPRESSED * dataset.id.get_storage_size()
 
 
 def _columns(file: h5py.File) -> dict[str, h5py.Dataset]:

@@ -143,3 +143,27 @@ def test_an_offset_beyond_all_time_is_named(tmp_path: Path):
         file["t_offset"] = np.uint64(2**63 + 5)
     with pytest.raises(RecordingError, match="/t_offset is 9223372036854775813, expected within"):
         read_recording(path, WIDTH, HEIGHT)
+
+
+def test_lengths_that_are_only_declared_are_refused_at_once(tmp_path: Path):
+    from ebarf_ns.formats.raw_inspection import inspect_recording
+    from ebarf_ns.formats.recognise import open_recording
+
+    path = tmp_path / "events.h5"
+    with h5py.File(path, "w") as file:
+        for name, dtype in (("x", "u2"), ("y", "u2"), ("t", "i8"), ("p", "u1")):
+            file.create_dataset(f"events/{name}", (10**11,), dtype, chunks=(1024,))[:2000] = 0
+    with pytest.raises(RecordingError, match=r"declares 100,000,000,000 events .*stores none"):
+        RecordingFile(path, 4, 4).span()
+    with pytest.raises(RecordingError, match=r"declares 100,000,000,000 events .*stores none"):
+        inspect_recording(lambda: open_recording(path, "hdf5"))
+
+
+def test_an_offset_of_times_is_one_number(tmp_path: Path):
+    path = tmp_path / "events.h5"
+    write_recording(path, [Recording(*(np.zeros(3, kind) for kind in ("u2", "u2", "i8")), np.ones(3, "i1"))])
+    with h5py.File(path, "r+") as file:
+        del file["t_offset"]
+        file.create_dataset("t_offset", (10**11,), "i8", chunks=(1024,))
+    with pytest.raises(RecordingError, match="/t_offset is not one integer"):
+        RecordingFile(path, 4, 4).span()

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 
 from ebarf_ns.errors import RecordingError
+from ebarf_ns.events.recording import is_stored
 from ebarf_ns.formats.columns import (
     ROLES,
     coarseness,
@@ -137,7 +138,8 @@ def _offset(file: h5py.File, name: str, time: _Column, unit: TimeUnit) -> tuple[
     """The offset of all times in microseconds, beside the columns or at top level, with a note."""
     beside = f"{name}/t_offset" if name and isinstance(file[name], h5py.Group) else "t_offset"
     found = next((key for key in (beside, "t_offset") if key in file), None)
-    value = np.asarray(file[found]).reshape(-1) if found else np.zeros(1)
+    stored: Any = file[found] if found else None
+    value = np.zeros(1) if stored is None else np.asarray(stored).reshape(-1) if stored.size == 1 else np.zeros(0)
     if len(value) != 1 or value.dtype.kind not in "iuf" or not fits(value, unit).all():
         return 0, [f"/{found} is not a time, and is not added to the times"]
     if not value[0]:
@@ -287,6 +289,8 @@ def _check(path: Path, group: str, columns: dict[str, _Column]) -> None:
             raise RecordingError(
                 f"{path}: /{group} has {role} of type {column.dtype}, expected integers (t: or floats)"
             )
+        if not is_stored(column.data):
+            raise RecordingError(f"{path}: /{group} declares {len(column):,} events in {role} and stores none")
 
 
 def _microseconds(path: Path, group: str, t: np.ndarray, first: int, unit: TimeUnit) -> np.ndarray:
