@@ -1,4 +1,4 @@
-"""The mean of the last steps' parameters, which chance moves less than the last ones (Polyak and Juditsky, 1992)."""
+"""A running average of the parameters over the last steps, less noisy than the last step's (Polyak, Juditsky 1992)."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 
 class Averaging:
-    """Follows parameters with their mean over the last tenth of the steps, over ``steps`` of them at most."""
+    """A running mean of parameters over about the last tenth of the steps, at most ``steps`` of them."""
 
     def __init__(self, parameters: list[nn.Parameter], steps: int):
         self.parameters, self.steps = parameters, steps
         self.mean: list[Tensor] | None = None
 
     def follow(self, steps_done: int) -> None:
-        """Take in the parameters after a step."""
+        """Update the mean after a training step."""
         if self.steps == 1:
             self.mean = None
             return
@@ -29,13 +29,13 @@ class Averaging:
             mean.lerp_(parameter, share)
 
     def begin_from(self, trained: list[Tensor] | None) -> None:
-        """Take the parameters as they are for the mean, and those ``trained`` in their place, where there are any."""
+        """Use the current parameters as the mean, and replace them with ``trained``, if given."""
         self.mean = [parameter.detach().clone() for parameter in self.parameters]
         self._put(trained or self.mean)
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """The parameters at their mean, for as long as the block lasts."""
+        """Replace the parameters by their mean while the block runs."""
         live = [parameter.detach().clone() for parameter in self.parameters]
         try:
             self._put(self.mean or live)

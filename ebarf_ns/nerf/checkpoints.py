@@ -1,4 +1,4 @@
-"""Checkpoints that are always whole and always good: verified before they are written and after they are read."""
+"""Checkpoints: written atomically, and verified by checksum when they are read."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from ebarf_ns.files import is_special, synced, whole_file
 FORMAT = 1
 _KEPT = 2
 _NAME = re.compile(r"step-\d+\.ckpt")
-# What the system says of a file that it does not give, whatever is in it.
+# Errors that say nothing about the file's content.
 _NOT_GIVEN = {errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE, errno.ETIMEDOUT, errno.ENOMEM}
 _PLAIN = (str, int, float, bool, type(None))
 
 
 class UnopenedCheckpointError(TrainingError):
-    """A checkpoint that may be good, but cannot be read here: an older one is no substitute."""
+    """A checkpoint that may be good but cannot be read here; an older one must not replace it."""
 
 
 def write_checkpoint(state: dict[str, Any], path: Path) -> None:
-    """Write a state of tensors and plain values whole, then remove all checkpoints but it and the one before.
+    """Write a state of tensors and plain values atomically, and keep only this checkpoint and the previous one.
 
-    Those of later steps are of a training that was not gone on with, or damaged.
+    Checkpoints of later steps are removed too: they are damaged, or belong to a training that was not continued.
 
-    ``state["pipeline"]`` gets a checksum of its own, since nerfstudio's scripts read that part alone. Raises
-    :class:`TrainingError` where the disk does not take it; what was there before stays.
+    ``state["pipeline"]`` gets its own checksum, since nerfstudio's scripts read only that part. Raises
+    :class:`TrainingError` if writing fails; existing checkpoints are then kept.
     """
     state = {**state, "format": FORMAT, "pipeline": sealed(state["pipeline"])}
     state["checksum"] = checksum(state)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the folder, not in it: nerfstudio takes every name in there for a checkpoint.
+    # Beside the folder, not in it: nerfstudio takes every file in it for a checkpoint.
     beside = path.parent.parent / path.name
     write_plain(state, beside)
     beside.replace(path)
@@ -50,31 +50,33 @@ def write_checkpoint(state: dict[str, Any], path: Path) -> None:
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
-    """A run's checkpoints, by their steps; not what else a user may keep beside them."""
+    """A run's checkpoints, sorted by step; other files in the folder are ignored."""
     return sorted(path for path in folder.glob("step-*.ckpt") if _NAME.fullmatch(path.name) and path.is_file())
 
 
 def write_plain(content: dict[str, Any], path: Path) -> None:
-    """Write tensors and plain values whole; raises :class:`TrainingError` where the disk does not take them."""
+    """Write tensors and plain values atomically; raises :class:`TrainingError` if writing fails."""
     try:
         with whole_file(path) as temporary:
             torch.save(content, temporary)
     except (OSError, RuntimeError) as error:
-        # Torch's own error is of positions in its archive, whatever the system said.
+        # Torch's own error reports positions in its archive, not the system's error.
         said = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
         raise TrainingError(f"{path}: cannot be written{said}; expected room on the disk") from None
 
 
 def read_plain(path: Path, what: str) -> dict[str, Any]:
-    """What :func:`write_plain` wrote, on the processor, and nothing that would run code; raises :class:`TrainingError`
-    that says what it should be."""
+    """Read a file written by :func:`write_plain` to the CPU, without running code from it.
+
+    Raises :class:`TrainingError`, with ``what`` the file should be.
+    """
     if is_special(path):
         raise TrainingError(f"{path}: a pipe or a device, expected a run's {what}")
     try:
         content = {**torch.load(path, map_location="cpu", weights_only=True)}
     except FileNotFoundError:
         raise TrainingError(f"{path}: is no file, expected a run's {what}") from None
-    except Exception as error:  # whatever damaged bytes make the unpickler raise
+    except Exception as error:  # the unpickler may raise anything for damaged data
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in _NOT_GIVEN):
             said = getattr(error, "strerror", None) or "not enough memory"
             raise UnopenedCheckpointError(f"{path}: cannot be read ({said}), expected a run's {what}") from None
@@ -87,7 +89,7 @@ def read_plain(path: Path, what: str) -> dict[str, Any]:
 
 
 def _not_plain(state: Any, name: str = "") -> str:
-    """The name of what is no plain value, or a tensor that is larger than what is stored of it; empty if all are."""
+    """The name of the first value that is not plain, or tensor that is larger than its storage; empty if none."""
     if isinstance(state, Tensor):
         dense = state.layout == torch.strided and state.device.type == "cpu"
         stored = dense and state.numel() * state.element_size() <= state.untyped_storage().nbytes()
@@ -101,9 +103,9 @@ def _not_plain(state: Any, name: str = "") -> str:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The state in a file, as tensors and plain values; raises :class:`TrainingError` where it is not what was written.
+    """The state in a file, as tensors and plain values; raises :class:`TrainingError` if it is damaged.
 
-    Checkpoints of before there were checksums are taken as they are.
+    Checkpoints from versions without checksums are accepted unverified.
     """
     state = read_plain(path, "checkpoint")
     if not isinstance(pipeline := state.get("pipeline"), dict) or not isinstance(state.get("step"), int):
@@ -121,9 +123,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def chosen_checkpoint(config: Any) -> tuple[Path | None, list[TrainingError]]:
-    """The checkpoint that a trainer's configuration goes on from, if any, and what is wrong with newer ones.
+    """The checkpoint that a trainer's configuration resumes from, if any, and the errors of damaged newer ones.
 
-    Raises :class:`TrainingError` where there is no such file.
+    Raises :class:`TrainingError` if the file does not exist.
     """
     damaged: list[TrainingError] = []
     if config.load_dir is None:
@@ -138,9 +140,9 @@ def chosen_checkpoint(config: Any) -> tuple[Path | None, list[TrainingError]]:
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[TrainingError]]:
-    """The newest checkpoint of a folder that can be read, and what is wrong with newer ones.
+    """The newest valid checkpoint of a folder, and the errors of damaged newer ones.
 
-    Raises :class:`TrainingError` where there is none, or where a newer one may be good, but cannot be read here.
+    Raises :class:`TrainingError` if there is none, or if a newer one may be good but cannot be read here.
     """
     wrong: list[TrainingError] = []
     for path in reversed(checkpoints_in(folder)):
@@ -156,12 +158,12 @@ def newest_whole(folder: Path) -> tuple[Path, list[TrainingError]]:
 
 
 def sealed(pipeline: dict[str, Tensor]) -> dict[str, Tensor]:
-    """A pipeline's state, with its checksum."""
+    """A pipeline's state with its checksum added."""
     return {**pipeline, "checksum": torch.tensor(checksum(pipeline))}
 
 
 def unsealed(pipeline: dict[str, Tensor], what: str) -> dict[str, Tensor]:
-    """A pipeline's state without its checksum, verified; raises :class:`TrainingError` with ``what`` it is of."""
+    """A pipeline's state, verified and without its checksum; raises :class:`TrainingError`, which names ``what``."""
     state = dict(pipeline)
     stored = state.pop("checksum", None)
     if stored is not None and not (isinstance(stored, Tensor) and stored.tolist() == checksum(state)):
@@ -172,7 +174,7 @@ def unsealed(pipeline: dict[str, Tensor], what: str) -> dict[str, Tensor]:
 
 
 def checksum(state: Any) -> int:
-    """CRC-32 of all names, values and tensors of a nested state, in order."""
+    """CRC-32 of all keys, values and tensors of a nested state, in order."""
     value = 0
     for leaf in _leaves(state):
         value = crc32(leaf, value)
@@ -180,7 +182,7 @@ def checksum(state: Any) -> int:
 
 
 def not_finite(state: Any, name: str = "") -> str:
-    """The name of the first tensor of a nested state that holds NaN or inf; empty where all are finite."""
+    """The name of the first tensor of a nested state that holds NaN or inf; empty if all are finite."""
     if isinstance(state, Tensor):
         return "" if not state.is_floating_point() or bool(state.isfinite().all()) else name
     items = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else ()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.Parameter]]:
-    """Nerfstudio's hash encoding in torch, and its parameters."""
+    """Nerfstudio's torch hash encoding, and its parameters."""
     encoding = HashEncoding(
         num_levels=shape.levels,
         min_res=shape.coarsest,
@@ -36,7 +36,8 @@ def hash_encoding(shape: HashGridShape, device: str) -> tuple[Callable, list[nn.
 def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float, dict[str, int]]:
     """Training rays per second of the registered method on a scene, and its planned grid under nerfacto's field names.
 
-    The first half of the steps is warm-up; then the median over groups of eight is taken, since every eighth does more.
+    The first half of the steps is warm-up. The rate is a median over groups of eight, since every eighth step does
+    more work.
     """
     from ebarf_ns.nerf.method import ebarf
     from ebarf_ns.nerf.trainer import EbarfTrainerConfig
@@ -68,7 +69,7 @@ def ebarf_rays_per_second(scene: Path, folder: Path, steps: int) -> tuple[float,
 
 
 def nerfacto_rays_per_second(shape: dict[str, Any], rays: int, repetitions: int) -> float:
-    """Training rays per second of stock nerfacto in torch, without its data manager, on the device that ebarf uses.
+    """Training rays per second of stock nerfacto in torch, without its data manager, on the same device as ebarf.
 
     Proposal networks are trained as rarely as after 5,000 steps. ``shape`` overrides configuration fields.
     """

@@ -1,4 +1,4 @@
-"""Event pairs to camera-frame rays: what nerfstudio calls the data manager."""
+"""The data manager: event pairs to rays in the camera frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -47,58 +47,58 @@ class EventDataManagerConfig(VanillaDataManagerConfig):
     _target: type = field(default_factory=lambda: EventDataManager)
     dataparser: DataParserConfig = field(default_factory=EbarfDataParserConfig)
     train_num_rays_per_batch: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Rays per step, two for each event pair; None: as planned."""
+    """Rays per step, two per event pair; None: as planned."""
     eval_num_rays_per_batch: int = 8192
-    """Rays of the held-out pairs: two for each."""
+    """Rays of the held-out event pairs, two per pair."""
     longest_pair: int = 30
-    """Pairs reach back 1 to this many events, log-uniformly; 1 takes consecutive events, as the paper does."""
+    """Pairs span 1 to this many events, drawn log-uniformly; 1: only consecutive events, as in the paper."""
     silent_share: float | None = None
-    """Share of a batch's pairs that end while the pixel is silent, not with an event; None: as planned."""
+    """Share of a batch's pairs that end while the pixel is silent rather than with an event; None: as planned."""
     doubles_us: int | None = None
-    """Leave out events that repeat the one before at their pixel within this time; 0: none; None: as found."""
+    """Leave out events that repeat the previous one of their pixel within this time; 0: none; None: as found."""
     blank_share: float | None = None
-    """Share of a batch's pairs that join two pixels which never fire, as parts of one surface; None: as planned."""
+    """Share of a batch's pairs that join two pixels that never fire, as parts of one surface; None: as planned."""
     refractory_us: int | None = None
-    """How long a pixel is blind after an event, 0: not at all; None: as the scene states it, else as found."""
+    """Refractory period of a pixel after an event; 0: none; None: as stated in the scene, else as found."""
     leave_out_hot_pixels: bool = True
-    """Train without the pixels that are far busier than those around them."""
+    """Train without pixels that are far busier than their neighbours."""
     leave_out_flicker: bool = True
-    """Train without the pixels that follow a flickering lamp, where they are less than half of all."""
+    """Train without pixels that follow a flickering lamp, if they are less than half of all."""
     heldout_share: float = 0.05
-    """Share of the recording's time whose events are kept for heldout_event_loss."""
+    """Share of the recording's time whose events are held out for heldout_event_loss."""
     index_memory_gib: float = 4.0
-    """An index of events that needs more than this (12 bytes an event) is kept in a file, under TMPDIR."""
+    """An event index larger than this (12 bytes per event) is kept in a file under TMPDIR."""
     seed: tyro.conf.Suppress[int] = 0
-    """Set by the trainer to --machine.seed; batch number k of a seed is always the same batch."""
+    """Set by the trainer to --machine.seed; batch k of a seed is always the same."""
 
 
 class EventDataManager(VanillaDataManager[EventDataset]):
-    """Hands out rays in the camera's own frame, with their times; poses live in the model.
+    """Provides rays in the camera frame with their times; the model holds the poses.
 
-    What reads the recording is a cached property: nerfstudio's viewer looks at every other attribute there is.
+    Attributes that read the recording are cached properties: nerfstudio's viewer accesses all others.
     """
 
     config: EventDataManagerConfig
     train_dataset: EventDataset
     eval_dataset: EventDataset
     clock_offset_us = 0
-    """What the trajectory's times are off by."""
+    """Offset added to the trajectory's times."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.train_dataparser_outputs = self._kept_outputs
 
     def create_train_dataset(self) -> EventDataset:
-        """The keyframes' views."""
+        """The views of the keyframes."""
         dataset = super().create_train_dataset()
-        # All are of one size. Of 100,000, nerfstudio would look at each, for minutes; it does so where this is set.
+        # If this is set, nerfstudio compares the sizes of all views: minutes for 100,000, although all are equal.
         self._kept_outputs = self.train_dataparser_outputs
         self.train_dataparser_outputs = None  # pyright: ignore[reportAttributeAccessIssue]
         return dataset
 
     def setup_train(self) -> None:
-        """Index the pairs when a run begins; viewer and exporters do without the recording until they ask for rays."""
-        # Only a training asks for batches, and has planned them; ns-export says how many rays it wants.
+        """Index the events when a training starts; the viewer and exporters do not need the recording."""
+        # Only training uses batches, and their size is then planned; ns-export sets its own number of rays.
         rays = self.config.train_num_rays_per_batch or 1024
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
         if self.test_mode == "val":
@@ -113,23 +113,23 @@ class EventDataManager(VanillaDataManager[EventDataset]):
                 say(f"pixels are blind for {self.refractory_us:,} us after an event")
 
     def setup_eval(self) -> None:
-        """The loaders of full views that nerfstudio's scripts ask for."""
+        """Create the loaders of full views that nerfstudio's scripts use."""
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
         self.eval_dataloader = SpiralStart(self.eval_dataset, device=self.device)
 
     def show_from(self, refined: Callable[[Cameras], Cameras]) -> None:
-        """Take the cameras of all views for the refined ones, for whoever asks this data manager."""
+        """Replace the cameras of all views by the refined ones."""
         for dataset in (self.train_dataset, self.eval_dataset):
             dataset.show_from(refined(dataset.cameras))
         self.setup_eval()
 
     @cached_property
     def rank(self) -> int:
-        """Number of this process among those that train together, on however many machines."""
+        """Global rank of this process in distributed training."""
         return comms.get_rank()
 
     def shift_clock(self, offset_us: int) -> None:
-        """Take the trajectory's times for off by ``offset_us``: other events have poses then."""
+        """Set the offset of the trajectory's times to ``offset_us``, which changes the events that have poses."""
         if offset_us != self.clock_offset_us:
             self.clock_offset_us = offset_us
             for name in _BY_CLOCK:
@@ -137,7 +137,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def span_us(self) -> tuple[int, int]:
-        """The time in which there are both events and poses; events outside are counted and left out."""
+        """The time span with both events and poses; events outside are counted and left out."""
         scene: Scene = self.train_dataset.scene
         trajectory: Trajectory = self.train_dataset.metadata["trajectory"]
         file = self._recording
@@ -172,27 +172,27 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def hot_pixels_left_out(self) -> int:
-        """Number of pixels that are not trained on for being far busier than usual."""
+        """Number of hot pixels left out of training."""
         return self.index.hot_pixels if self.config.leave_out_hot_pixels else 0
 
     @cached_property
     def heldout_blocks(self) -> HeldoutBlocks:
-        """The stretches of time whose events no training sees."""
+        """The time blocks whose events are held out from training."""
         return HeldoutBlocks(*self.span_us, self.config.heldout_share)
 
     @cached_property
     def facts(self) -> SensorFacts:
-        """What the recording tells of its sensor, whatever flags say: what methods are compared by."""
+        """Sensor properties estimated from the recording, independent of flags, so that methods can be compared."""
         return identify(self.index, self.train_dataset.scene.refractory_us)
 
     @property
     def refractory_us(self) -> int:
-        """How long pixels are taken to be blind after an event."""
+        """The refractory period used in training."""
         return self.config.refractory_us or 0
 
     @cached_property
     def _training_batches(self) -> DrawAhead:
-        # Before there are threads: each of them would make one of its own.
+        # Create it before the threads start: otherwise each of them would create its own.
         _ = self._training_index
         ahead = 1 if torch.device(self.device).type == "cpu" else 4
         return DrawAhead(self._draw_training_pairs, self.world_size, ahead)
@@ -214,13 +214,13 @@ class EventDataManager(VanillaDataManager[EventDataset]):
             )
         if not silent:
             return pairs
-        # Twice as many, as some of them end before the first event or in held-out time.
+        # Draw twice as many, since some end before the first event or in held-out time.
         drawn = self._training_index.draw_silent(
             2 * silent, self.config.longest_pair, self.span_us, random, self.refractory_us
         )
         parts = [pairs, drawn.select(self.heldout_blocks.training(drawn)).select(slice(silent))]
         if blank:
-            # Most of them join a blank pixel with one that fires.
+            # Draw more, since most join a blank pixel with one that fires.
             width = self.train_dataset.scene.camera.width
             parts.append(self._training_index.draw_blank(4 * blank, width, self.span_us, random).select(slice(blank)))
         return joined(parts)
@@ -232,7 +232,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
 
     @cached_property
     def heldout_pairs(self) -> EventPairs:
-        """Pairs that no training sees, the same for every method and seed."""
+        """The held-out pairs, the same for every method and seed."""
         count = self.config.eval_num_rays_per_batch // 2
         random = batch_random(_HELDOUT_SEED, 0)
         accepted, refractory_us = self.heldout_blocks.heldout, round(self._believed_refractory_us)
@@ -245,7 +245,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return camera.bearings(camera.pixel_grid()).float().flatten(0, 1).to(self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, torch.Tensor]]:
-        """Rays of batch number ``step``; of whole views, and ever others, for scripts that open a finished run."""
+        """Rays of batch ``step``; for scripts that open a finished run, different random rays of any view each time."""
         self.train_count += 1
         if self.test_mode != "val":
             return self.view_rays(self.get_train_rays_per_batch(), self.train_count), {}
@@ -263,12 +263,12 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return self._rays(self.heldout_pairs)
 
     def get_train_rays_per_batch(self) -> int:
-        """What ns-export overwrites by --num-rays-per-batch."""
+        """Rays per batch, which ns-export overrides with --num-rays-per-batch."""
         assert self.train_pixel_sampler is not None
         return self.train_pixel_sampler.num_rays_per_batch
 
     def view_rays(self, count: int, number: int) -> RayBundle:
-        """Rays of any pixels at any times within the trajectory; what there are events of does not matter."""
+        """Rays of random pixels at random times within the trajectory, whether or not they have events."""
         scene, random = self.train_dataset.scene, batch_random(_VIEWS_SEED, number)
         trajectory: Trajectory = self.train_dataset.metadata["trajectory"]
         first_us, last_us = (int(t_us) + self.clock_offset_us for t_us in trajectory.t_us[[0, -1]])
@@ -277,7 +277,7 @@ class EventDataManager(VanillaDataManager[EventDataset]):
         return self.rays_at(torch.from_numpy(pixel), torch.from_numpy(t_us))
 
     def rays_at(self, pixel: Int64[Tensor, "rays"], t_us: Int64[Tensor, "rays"]) -> RayBundle:
-        """Rays of pixels, given by their row-major numbers, in the camera's frame, for the model to place in time."""
+        """Rays of pixels (row-major index) in the camera frame, with times at which the model places them."""
         pixel = pixel.to(self.device)
         directions = self.bearings[pixel]
         return RayBundle(

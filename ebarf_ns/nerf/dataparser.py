@@ -1,6 +1,6 @@
-"""Scene folder to nerfstudio cameras: one camera a keyframe for training, one a frame for evaluation.
+"""Scene folder to nerfstudio cameras: one per keyframe for training, one per frame for evaluation.
 
-Kept light: nerfstudio imports this module while its own are half loaded.
+Imports little, since nerfstudio imports this module while it is itself only partly loaded.
 """
 
 import re
@@ -25,21 +25,21 @@ from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.scene import Frame, Scene, box_of_bounds, check_bounds, read_scene, write_scene
 
-# Without bounds, the trajectory fills this share of the part of space that is not contracted.
+# Without bounds, the trajectory fills this share of the uncontracted part of space.
 _TRAJECTORY_SHARE = 0.25
 _STAND_IN_VIEWS = 8
 _ASIDE_PX = 1e-3
-# The data manager's, which is read first; the folder's parts may be on lines of their own.
+# The data manager's entry, which takes precedence; the parts of the path may be on separate lines.
 _DATA = re.compile(r"^    data:.*\n((?:    - .*\n)*)", re.MULTILINE)
 
 
 class Normalization(NamedTuple):
-    """World to training coordinates: (point - centre) * scale, so that the scene's longest side fills [-1, 1]."""
+    """World to training coordinates: (point - centre) * scale; the scene's longest side fills [-1, 1]."""
 
     centre: Float[Tensor, "3"]
     scale: float
     half_sides: Float[Tensor, "3"]
-    """Of the scene, in training coordinates."""
+    """Half the side lengths of the scene, in training coordinates."""
 
     def apply(self, trajectory: Trajectory) -> Trajectory:
         """World poses to training coordinates, float32."""
@@ -63,12 +63,12 @@ class EbarfDataParserConfig(DataParserConfig):
     data: Path = Path("scene")
     """The scene folder."""
     kept: tyro.conf.Suppress[Path | None] = None
-    """What a trained run has of its scene: it is opened by that where the scene is gone. Training fills it in."""
+    """The run's own copy of its scene, used if the scene is gone; set by training."""
 
 
 @dataclass
 class EbarfDataParser(DataParser):
-    """Reads scene.json and the trajectory; the recording is left to the data manager."""
+    """Reads scene.json and the trajectory; the data manager reads the recording."""
 
     config: EbarfDataParserConfig
 
@@ -103,13 +103,13 @@ class EbarfDataParser(DataParser):
 
     def _keyframe_views(self, keyframes: Trajectory, every: int = 1) -> tuple[Cameras, list[Path]]:
         chosen = Trajectory(keyframes.t_us[::every], Poses(*(column[::every] for column in keyframes.poses)))
-        # Names of 100,000 files, put together one by one by pathlib, would take seconds.
+        # Joining 100,000 file names with pathlib would take seconds.
         folder = str(self.scene.folder / "keyframes")
         files = [Path(f"{folder}/{t_us}.png") for t_us in chosen.t_us.tolist()]
         return _nerfstudio_cameras([self.scene.camera] * len(files), chosen.t_us, chosen.poses.matrix()), files
 
     def _evaluation_views(self, keyframes: Trajectory) -> tuple[Cameras, list[Path]]:
-        """The frames within the trajectory's span, or else a few keyframes, so that there is something to look at."""
+        """The frames within the trajectory's span; if there are none, a few keyframes, so that something is shown."""
         times = torch.tensor([frame.t_us for frame in self.scene.frames], dtype=torch.int64)
         inside = within_span(times, keyframes.t_us)
         frames = [frame for frame, keep in zip(self.scene.frames, inside.tolist(), strict=True) if keep]
@@ -120,7 +120,7 @@ class EbarfDataParser(DataParser):
 
 
 def keep_scene(scene: Scene, folder: Path) -> None:
-    """Write what a trained run needs of its scene: all but recording and frames, which may be large."""
+    """Write a copy of a scene for a trained run, without recording and frames, which may be large."""
     with whole_folder(folder) as kept:
         copies = {}
         for name in ("trajectory", "groundtruth"):
@@ -131,7 +131,7 @@ def keep_scene(scene: Scene, folder: Path) -> None:
 
 
 def moved(config: EbarfDataParserConfig) -> str:
-    """Where a scene is not, and how a trained run is told where it is."""
+    """An error text: the scene folder is missing, and how to set its new location in the run's config.yml."""
     said = f"{Path(config.data).absolute()}: no such folder, expected the scene of the run; where it was moved, change"
     path = config.kept.parent / "config.yml" if config.kept else None
     found = _DATA.search(path.read_text(encoding="utf-8")) if path and path.is_file() else None
@@ -143,7 +143,7 @@ def moved(config: EbarfDataParserConfig) -> str:
 
 
 def _scene_folder(config: EbarfDataParserConfig) -> Path:
-    """The scene, or where it is gone what the run has kept of it."""
+    """The scene folder, or the run's own copy if the folder is gone."""
     folder = Path(config.data)
     if folder.is_dir():
         return folder
@@ -154,7 +154,7 @@ def _scene_folder(config: EbarfDataParserConfig) -> Path:
 
 
 def _say_what_is_missing(scene: Scene) -> None:
-    """Frames show how good a training is, and it goes on without them."""
+    """Warn of missing frame files; training does not need them."""
     if scene.missing:
         sys.stderr.write(
             f"warning: {scene.missing[0]}: no such file; {len(scene.missing)} of the validation frames' files are "
@@ -163,7 +163,7 @@ def _say_what_is_missing(scene: Scene) -> None:
 
 
 def _check_scene_is_the_runs(scene: Scene, trajectory: Trajectory, kept: Path | None) -> None:
-    """Another scene may have come to the place of the one that a run was trained on."""
+    """Raise :class:`SceneError` if the scene's trajectory is not the one that the run was trained on."""
     if kept is None or not (kept / "trajectory.txt").is_file():
         return
     trained = read_tum(kept / "trajectory.txt")
@@ -186,9 +186,9 @@ def _normalization(scene: Scene, trajectory: Trajectory) -> Normalization:
 
 
 def _reference_units(scene: Scene, trajectory: Trajectory) -> float:
-    """The trajectory's unit in the reference's, which is that of a rig's calibration; 1 where nobody knows or asks.
+    """The trajectory's unit in units of the reference, which the rig's calibration uses; 1 if unknown or not needed.
 
-    A trajectory's scale is free, and one camera beside another shows where a frame was taken in metres.
+    A trajectory's scale is arbitrary, but the offset of the frame camera from the event camera is given in metres.
     """
     if scene.groundtruth is None or not any(_apart(frame) for frame in scene.frames):
         return 1.0
@@ -211,8 +211,10 @@ def opengl_from_opencv(camera_to_world: Float[Tensor, "*batch 3 4"]) -> Float[Te
 
 
 def frame_cameras(frames: list[Frame], event_camera: Trajectory, mount_scale: float) -> Cameras:
-    """The cameras of frames, given the event camera's pose in training coordinates at each frame's time, and a unit of
-    the rig's calibration in training coordinates."""
+    """The cameras of frames, from the event camera's pose in training coordinates at each frame's time.
+
+    ``mount_scale`` is a unit of the rig's calibration in training coordinates.
+    """
     mount = torch.tensor([frame.event_camera_from_frame_camera for frame in frames])
     pose = event_camera.poses.matrix()
     rotation = pose[:, :, :3] @ mount[:, :3, :3]
@@ -223,7 +225,7 @@ def frame_cameras(frames: list[Frame], event_camera: Trajectory, mount_scale: fl
 
 
 def replace_intrinsics(cameras: Cameras, given: Camera, learned: Camera) -> None:
-    """Give those of the cameras that are the event camera, by its intrinsics as given, the intrinsics learned."""
+    """Set the learned intrinsics of those cameras that have the given intrinsics of the event camera."""
     one = Trajectory(torch.zeros(1, dtype=torch.int64), Poses(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])))
     before, after = (_nerfstudio_cameras([camera], one.t_us, one.poses.matrix()) for camera in (given, learned))
     columns = ("fx", "fy", "cx", "cy", "width", "height")
@@ -237,7 +239,7 @@ def replace_intrinsics(cameras: Cameras, given: Camera, learned: Camera) -> None
 def _nerfstudio_cameras(
     cameras: list[Camera], t_us: Int64[Tensor, "cameras"], camera_to_world: Float[Tensor, "cameras 3 4"]
 ) -> Cameras:
-    # Mostly one and the same, 100,000 times.
+    # There may be 100,000 of them, nearly always the same camera.
     kinds = {camera: k for k, camera in enumerate(dict.fromkeys(cameras))}
     which = torch.tensor([kinds[camera] for camera in cameras])
 
@@ -245,13 +247,13 @@ def _nerfstudio_cameras(
         return torch.tensor([[getattr(camera, name)] for camera in kinds])[which]
 
     fisheye = torch.tensor([[camera.model == "equidistant"] for camera in kinds])[which]
-    # At the very centre of a fisheye, nerfstudio divides 0 by 0.
+    # Nerfstudio divides 0 by 0 at the exact centre of a fisheye.
     aside = _ASIDE_PX * fisheye
     return Cameras(
         camera_to_worlds=opengl_from_opencv(camera_to_world),
         fx=column("fx"),
         fy=column("fy"),
-        cx=column("cx") + 0.5 + aside,  # nerfstudio's pixel centres are at half integers
+        cx=column("cx") + 0.5 + aside,  # nerfstudio's pixel centres are at half-integers
         cy=column("cy") + 0.5,
         width=column("width"),
         height=column("height"),

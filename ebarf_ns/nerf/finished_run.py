@@ -1,4 +1,4 @@
-"""A finished run, opened from its folder alone: its field and its trajectory in the input's world frame."""
+"""A finished run, opened from its folder: its field and its trajectory in the input's world frame."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from ebarf_ns.nerf.pipeline import EbarfPipeline
 
 _RAYS_AT_ONCE = 8192
-# Residual density lies in front of surfaces, not behind them, so that the median depth is too small: on simulated
-# scenes, this quantile has the smallest bias.
+# Residual density lies in front of surfaces, not behind them, so the median depth is too small. On simulated scenes,
+# this quantile has the smallest bias.
 _SURFACE_QUANTILE, _SPREAD_QUANTILES = 2 / 3, (1 / 3, 5 / 6)
 
 
 class FinishedRun:
-    """The subject of :mod:`ebarf_ns.export`."""
+    """A finished run, as :mod:`ebarf_ns.export` uses it."""
 
     def __init__(self, pipeline: EbarfPipeline, sensor: SensorModel):
         self._model, self.sensor = pipeline.model, sensor
@@ -46,14 +46,14 @@ class FinishedRun:
 
     @torch.no_grad()
     def poses_at(self, t_us: Int64[Tensor, "times"]) -> Poses:
-        """Refined poses, float64; times outside the trajectory's span count as its nearer end."""
+        """Refined poses, float64; times outside the trajectory's span are clamped to it."""
         keyframes = self._model.camera_optimizer
         poses = keyframes.poses_at(t_us.to(keyframes.keyframe_t_us))
         return self._normalization.invert(Trajectory(t_us, poses)).poses
 
     @torch.no_grad()
     def see(self, origin: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]) -> Seen:
-        """What rays with unit directions see."""
+        """Cast rays with unit directions."""
         centre, scale = self._normalization.centre.numpy(), self._normalization.scale
         device = self._model.device
         start = torch.from_numpy(((origin - centre) * scale).astype(np.float32)).to(device).split(_RAYS_AT_ONCE)
@@ -72,34 +72,34 @@ class FinishedRun:
 
 
 def open_run(folder: Path) -> FinishedRun:
-    """Open a run's newest whole checkpoint, wherever the folder was moved.
+    """Open the newest valid checkpoint of a run, whose folder may have been moved.
 
-    No code in the folder is run. Raises :class:`EvaluationError`, and what its scene and checkpoints raise.
+    No code in the folder is run. Raises :class:`EvaluationError` and the errors of its scene and checkpoints.
     """
     config = read_run_config(folder / "config.yml")
     checkpoint, damaged = newest_whole(folder / "nerfstudio_models")
     for error in damaged:
         sys.stderr.write(f"{error}; {checkpoint.name} is taken\n")
-    if (folder / "scene" / "scene.json").is_file():
-        config.pipeline.datamanager.dataparser.kept = folder / "scene"  # pyright: ignore[reportAttributeAccessIssue]
     state = read_checkpoint(checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
+        if (folder / "scene" / "scene.json").is_file():
+            config.pipeline.datamanager.dataparser.kept = folder / "scene"  # pyright: ignore[reportAttributeAccessIssue]
         pipeline: EbarfPipeline = config.pipeline.setup(device=device, test_mode="inference").eval()
         pipeline.load_pipeline(state["pipeline"], state["step"])
     except (AttributeError, TypeError, ValueError, LookupError, RuntimeError, MemoryError) as error:
-        # What is in the two files may be anything.
+        # The two files may contain anything.
         said = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
         raise EvaluationError(
             f"{folder}: cannot be opened ({said}), expected config.yml and {checkpoint.name} to be of one ebarf run"
         ) from None
-    # Nothing is learned any more: a time constant of zero counts as no delay.
+    # After training, a time constant of zero means no delay.
     pipeline.requires_grad_(False)
     return FinishedRun(pipeline, _sensor(pipeline, folder))
 
 
 def _sensor(pipeline: EbarfPipeline, folder: Path) -> SensorModel:
-    """What is known and what was learned of the sensor; Eq. 6 knows no thresholds, held-out events imply them."""
+    """The given and learned sensor parameters; with Eq. 6, thresholds are those implied by held-out events."""
     model, response = pipeline.model, pipeline.model.sensor
     if model.normalized:
         last = read_metrics(folder)[1][-1]

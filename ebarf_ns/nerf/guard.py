@@ -1,4 +1,4 @@
-"""A guard against bad numbers: no step with a bad gradient is taken, and none that follows from a bad parameter."""
+"""Guards against non-finite numbers: steps with bad gradients are skipped, and bad parameters end the training."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _SMALL, _PARTS = 1 << 16, 64
 
 
 class GuardedOptimizers(Optimizers):
-    """Steps all groups, or none where any gradient is not finite, or 10,000 times its usual norm.
+    """Steps all groups, or none if any gradient is not finite or exceeds 10,000 times its usual norm.
 
-    One bad batch must not poison Adam's moments, which forget slowly. Gradients that stay so large are taken from the
-    third on: then that is their norm.
+    One bad batch must not spoil Adam's moments, which decay slowly. If gradients stay that large, they are accepted
+    from the third on.
     """
 
     skipped = 0
     skipped_in_a_row = 0
     usual: Tensor | None = None
-    """Running mean of the norm of each parameter's gradient, and the number of gradients, up to 99."""
+    """Running mean of each parameter's gradient norm, and the number of gradients, up to 99."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.recently_skipped: deque[bool] = deque(maxlen=_RECENT_STEPS)
 
     def guard_state(self) -> dict[str, Any]:
-        """What a resumed training must know, as tensors and plain values."""
+        """The state for a resumed training, as tensors and plain values."""
         return {
             "skipped_steps": self.skipped,
             "skipped_in_a_row": self.skipped_in_a_row,
@@ -43,7 +43,7 @@ class GuardedOptimizers(Optimizers):
         }
 
     def load_guard_state(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`guard_state`, or from less of it."""
+        """Restore :meth:`guard_state`; missing entries keep their initial values."""
         self.skipped = state.get("skipped_steps", 0)
         self.skipped_in_a_row = state.get("skipped_in_a_row", 0)
         self.recently_skipped.extend(state.get("recently_skipped", torch.zeros(0)).tolist())
@@ -65,12 +65,12 @@ class GuardedOptimizers(Optimizers):
         return False
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
-        """Raises :class:`TrainingError` when too many steps had to be skipped."""
+        """Step, or skip the step; raises :class:`TrainingError` if too many steps are skipped."""
         parameters = [parameter for group in param_groups for parameter in self.parameters[group]]
-        # A gradient scaler looks for overflow itself, and lowers its scale when it finds it. Accumulating gradients, no
-        # group may be due.
+        # A gradient scaler checks for overflow itself and lowers its scale. With gradient accumulation, no group may
+        # be due.
         if grad_scaler.is_enabled() or not parameters or self._trusted(parameters):
-            # A step in which the keyframes do not learn says nothing of their gradients.
+            # A step in which the keyframes do not learn says nothing about their gradients.
             if all(one.grad is not None for one in self.parameters.get("camera_opt", ())):
                 self.skipped_in_a_row = 0
             self.recently_skipped.append(False)
@@ -86,7 +86,7 @@ class GuardedOptimizers(Optimizers):
             raise TrainingError(f"{sum(self.recently_skipped)} of the last {len(self.recently_skipped)} steps {cause}")
 
     def check_parameters(self, step: int) -> None:
-        """Raise :class:`TrainingError` where a parameter is not finite; of large ones, a part is looked at a step."""
+        """Raise :class:`TrainingError` if a parameter is not finite; of large ones, only a part is checked per step."""
         sums = []
         for parameter in (one for group in self.parameters.values() for one in group):
             flat = parameter.detach().reshape(-1)

@@ -1,4 +1,4 @@
-"""The methods that ns-train offers: ebarf, and as yardsticks ebarf-paper and enerf."""
+"""The methods registered with ns-train: ebarf, and the baselines ebarf-paper and enerf."""
 
 from typing import Literal
 
@@ -31,7 +31,7 @@ def _trainer(
         method_name=method_name,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=30_000,
-        # Evaluation goes by the budget, see EbarfTrainerConfig.evaluations.
+        # Evaluation follows the budget, see EbarfTrainerConfig.evaluations.
         steps_per_eval_batch=10**9,
         steps_per_eval_image=10**9,
         steps_per_eval_all_images=10**9,
@@ -48,22 +48,22 @@ def _trainer(
                 "optimizer": poses,
                 "scheduler": BudgetDecayConfig(),
             },
-            # Made use of with --learn-intrinsics alone.
+            # Used only with --learn-intrinsics.
             "intrinsics": {
                 "optimizer": KeyframeAdamConfig(lr=0.03),
                 "scheduler": BudgetDecayConfig(),
             },
         },
-        # The trainer has a live line of its own.
+        # The trainer prints its own live line.
         logging=LoggingConfig(steps_per_log=10, profiler="none", local_writer=LocalWriterConfig(enable=False)),
-        # Whoever reaches a viewer can drive it.
+        # Anyone who can reach the viewer can control it.
         viewer=ViewerConfig(num_rays_per_chunk=4096, websocket_host="127.0.0.1"),
         vis="viewer",
     )
 
 
 def _paper(method_name: str, mode: Literal["refine", "off"]) -> EbarfTrainerConfig:
-    """The seed paper's method; its baseline is the same with the poses frozen."""
+    """The E-BARF paper's method; its baseline is the same with frozen poses."""
     model = EbarfModelConfig(
         camera_optimizer=TrajectoryOptimizerConfig(
             mode=mode,
@@ -112,7 +112,7 @@ ebarf = MethodSpecification(
         EventDataManagerConfig(),
         EbarfModelConfig(),
         field_rate=1e-2,
-        # Parameters that are averaged need not come to rest.
+        # With parameter averaging, the learning rate need not decay as far.
         field_decay=0.3,
         averaged_steps=100,
         poses=KeyframeAdamConfig(lr=0.03),

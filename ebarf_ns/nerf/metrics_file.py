@@ -1,4 +1,4 @@
-"""``metrics.jsonl`` of a run: a header, then one line for each evaluation; and what it knows its scene by."""
+"""``metrics.jsonl`` of a run: a header with digests of scene and flags, then one line per evaluation."""
 
 import json
 import sys
@@ -20,18 +20,18 @@ _PLACES = {
 
 
 def begin_metrics(run: Path, header: Callable[[], dict[str, Any]], start_step: int) -> None:
-    """Write the header; a run that goes on in its own folder keeps what was evaluated up to ``start_step``."""
+    """Write the header; a run resumed in its own folder keeps its evaluations up to ``start_step``."""
     path = run / _NAME
     first, *records = (_lines(path) if start_step and path.is_file() else []) or [header()]
-    # What was evaluated after the checkpoint will be again.
+    # Later evaluations will be repeated.
     records = [record for record in records if record.get("step", 0) <= start_step]
     with whole_file(path) as temporary:
         temporary.write_text("".join(json.dumps(line) + "\n" for line in (first, *records)), encoding="utf-8")
 
 
 def record_metrics(run: Path, record: dict[str, Any]) -> None:
-    """Add a line."""
-    # All of it anew: what ends a run in the middle of a line would leave a file that nothing reads.
+    """Append a record."""
+    # Rewrite the whole file atomically, so that an interrupted run leaves no incomplete line.
     path = run / _NAME
     before = path.read_text(encoding="utf-8") if path.is_file() else ""
     with whole_file(path) as temporary:
@@ -39,13 +39,13 @@ def record_metrics(run: Path, record: dict[str, Any]) -> None:
 
 
 def read_header(run: Path) -> dict[str, Any]:
-    """The header; empty where there is no file, or nothing in it. Raises :class:`TrainingError`."""
+    """The header; empty if the file is missing or empty. Raises :class:`TrainingError` if it is no header."""
     path = run / _NAME
     return next(iter(_lines(path)), {}) if path.is_file() else {}
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
-    """All lines up to the first that is cut off."""
+    """All lines before the first incomplete one."""
     lines = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         try:
@@ -59,9 +59,9 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def scene_digest(scene: Scene) -> dict[str, str]:
-    """What tells whether a scene is still the same, part by part.
+    """A digest of each part of a scene, to tell whether it has changed.
 
-    Of a recording of more than 64 MiB, its size and as much, taken from all over it.
+    For recordings larger than 64 MiB, the digest covers the size and 64 MiB of samples spread over the file.
     """
     size = scene.events.stat().st_size
     events = sha256(str(size).encode())
@@ -75,7 +75,7 @@ def scene_digest(scene: Scene) -> dict[str, str]:
 
 
 def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
-    """What of a scene is not as it was for the run with this header; empty too where the run did not say."""
+    """The parts of a scene that changed since the run with this header; empty if the header has no digest."""
     before = header.get("scene_digest")
     if not isinstance(before, dict):
         return []
@@ -84,12 +84,12 @@ def changed_parts(scene: Scene, header: dict[str, Any]) -> list[str]:
 
 
 def flags_of(configuration: Any) -> dict[str, Any]:
-    """The settings of a run by the names of their flags, in plain values; not those that say where it lies."""
+    """The settings of a run by flag name, as plain values, without those for its location."""
     return {name: value for name, value in _flags(configuration) if name.split(".")[-1] not in _PLACES}
 
 
 def config_digest(flags: dict[str, Any]) -> str:
-    """What tells whether a run was configured alike."""
+    """A digest that is equal for runs with equal flags."""
     return _digest(json.dumps(flags).encode())
 
 
@@ -104,7 +104,7 @@ def _flags(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     elif value is None or isinstance(value, bool | int | float | str):
         yield name, value
     else:
-        # The text of classes and functions may hold an address.
+        # The text of classes and functions may contain a memory address.
         yield name, getattr(value, "__qualname__", None) or str(value)
 
 

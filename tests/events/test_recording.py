@@ -161,7 +161,8 @@ def test_lengths_that_are_only_declared_are_refused_at_once(tmp_path: Path):
 
 def test_an_offset_of_times_is_one_number(tmp_path: Path):
     path = tmp_path / "events.h5"
-    write_recording(path, [Recording(*(np.zeros(3, kind) for kind in ("u2", "u2", "i8")), np.ones(3, "i1"))])
+    pixels = np.zeros(3, np.uint16)
+    write_recording(path, [Recording(pixels, pixels, np.zeros(3, np.int64), np.ones(3, np.int8))])
     with h5py.File(path, "r+") as file:
         del file["t_offset"]
         file.create_dataset("t_offset", (10**11,), "i8", chunks=(1024,))

@@ -209,6 +209,8 @@ def test_a_signal_ends_a_run_whole(
 
     monkeypatch.setattr(ready.averaging, "follow", interrupted)
     before = signal.getsignal(number)
+    if before == signal.SIG_IGN:
+        pytest.skip("this process is to ignore the signal, as nohup has it")
     with pytest.raises(SystemExit) as stopped:
         ready.train()
     assert stopped.value.code == code and signal.getsignal(number) == before
