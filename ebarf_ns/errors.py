@@ -1,4 +1,4 @@
-"""What goes wrong for a user: one class per room, one line per message, exit code 2."""
+"""Errors that users can cause: one class per package, one line per message, exit code 2."""
 
 import sys
 from collections.abc import Iterator
@@ -8,15 +8,15 @@ from pathlib import Path
 
 
 class EbarfError(Exception):
-    """Base of everything a user can cause and cure; the message names file, place, value and expectation."""
+    """Base of all errors that a user can cause and fix; the message names file, place, value and expectation."""
 
     def __str__(self) -> str:
-        # What a library says, which messages quote, may have many lines.
+        # Messages may quote multi-line library errors.
         return " ".join(super().__str__().splitlines())
 
 
 class SceneError(EbarfError):
-    """The scene folder or its scene.json is not as the format says."""
+    """The scene folder or its scene.json does not follow the format."""
 
 
 class RecordingError(EbarfError):
@@ -28,11 +28,11 @@ class TrajectoryError(EbarfError):
 
 
 class OdometryError(EbarfError):
-    """No trajectory can be vouched for that events alone tell."""
+    """No reliable trajectory can be estimated from events alone."""
 
 
 class TrainingError(EbarfError):
-    """The training cannot go on."""
+    """The training cannot start or continue."""
 
 
 class EvaluationError(EbarfError):
@@ -40,11 +40,11 @@ class EvaluationError(EbarfError):
 
 
 class SimulationError(EbarfError):
-    """The simulation was asked for something that it cannot make."""
+    """The simulation cannot produce what was requested."""
 
 
 class ExportError(EbarfError):
-    """A run cannot be exported as it was asked for."""
+    """A run cannot be exported as requested."""
 
 
 class NoSurfaceError(ExportError):
@@ -52,12 +52,12 @@ class NoSurfaceError(ExportError):
 
 
 class BenchmarkError(EbarfError):
-    """A benchmark was asked for something that cannot be measured."""
+    """A benchmark cannot measure what was requested."""
 
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turn an :class:`EbarfError`, or what the system refuses, into one line on standard error and exit code 2."""
+    """Turn an :class:`EbarfError` or a system error into one line on standard error and exit code 2."""
     try:
         yield
     except (EbarfError, OSError) as error:

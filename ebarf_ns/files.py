@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all: written under a temporary name beside the target, then renamed."""
+"""Atomic outputs: written under a temporary name beside the target, then renamed."""
 
 import os
 import shutil
@@ -17,7 +17,8 @@ from ebarf_ns.errors import EbarfError
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path to write to; it becomes ``path`` when the block ends without an exception.
 
-    A link stays, and what it leads to is replaced. Raises :class:`EbarfError` where ``path`` is a pipe or a device.
+    The target of a symbolic link is replaced, not the link. Raises :class:`EbarfError` if ``path`` is a pipe or a
+    device.
     """
     target = path.resolve()
     if is_special(target):
@@ -35,7 +36,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.replace(target)
         synced(target.parent)
     except OSError as error:
-        # A full disk does not say of itself what found it full, and nobody knows the temporary name.
+        # The error of a full disk has no file name, and the temporary name means nothing to users.
         if error.filename is None or Path(os.fsdecode(error.filename)).name.startswith(f".{path.stem}."):
             error.filename, error.filename2 = str(path), None
         raise
@@ -45,7 +46,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def synced(folder: Path) -> None:
-    """Have the system write down what names a folder holds, where it can."""
+    """Sync a folder's entries to disk, if the system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -64,7 +65,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
         if path.exists():
-            # Put away before it is removed, which takes its time.
+            # Move it away first, since removing it takes time.
             before = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
             path.replace(before)
             temporary.replace(path)
@@ -76,22 +77,22 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def refuse_existing(folder: Path) -> None:
-    """Raise :class:`EbarfError` where a folder that is to be made would replace something."""
+    """Raise :class:`EbarfError` if an output folder would replace something."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise EbarfError(f"{folder}: exists, expected a new folder; remove it first where it is not needed")
-    # The finished folder takes the place of an empty one, which these cannot give up.
+    # The finished folder replaces an empty one, which is impossible for these.
     if folder.exists() and (os.path.ismount(folder) or folder.samefile(Path.cwd())):
         raise EbarfError(f"{folder}: the current folder or a mounted one, expected a new folder, which may be in it")
 
 
 def is_special(path: Path) -> bool:
-    """Whether a path names a pipe, a socket or a device: to read one may take for ever."""
+    """Whether a path is a pipe, a socket or a device, reading which may block for ever."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @contextmanager
 def opened_npz(path: Path) -> Iterator[Any]:
-    """The arrays of an npz file, by name; whatever a damaged one makes the libraries raise is a ValueError."""
+    """The arrays of an npz file by name; raises ValueError for damaged files, whatever the libraries raise."""
     try:
         with np.load(path) as file:
             yield file
@@ -102,9 +103,9 @@ def opened_npz(path: Path) -> Iterator[Any]:
 
 
 def read_picture(path: Path, flags: int = -1) -> np.ndarray | None:
-    """The pixels of an image file by OpenCV's flags, None where it is no image.
+    """The pixels of an image file, read with OpenCV's flags; None if it is no image.
 
-    OpenCV opens no file by itself: on Windows it knows only the names of one code page.
+    OpenCV does not open the file itself: on Windows, it only supports file names in one code page.
     """
     import cv2
 
@@ -113,7 +114,7 @@ def read_picture(path: Path, flags: int = -1) -> np.ndarray | None:
 
 
 def write_picture(path: Path, pixels: np.ndarray) -> None:
-    """An image file of the kind that its name says."""
+    """Write an image file in the format of its suffix."""
     import cv2
 
     cv2.imencode(path.suffix, pixels)[1].tofile(path)

@@ -1,4 +1,4 @@
-"""What is in a scene folder, and what looks wrong in it."""
+"""The contents of a scene folder, and what looks wrong in it."""
 
 from dataclasses import dataclass, field
 from math import atan2, degrees
@@ -25,13 +25,13 @@ from ebarf_ns.scene import Scene, check_bounds, check_clocks, events_left_out, r
 
 _FEW_EVENTS_PER_PIXEL = 5
 _FEW_PIXELS = 0.005
-# Lenses that see more, or less, are rarer than focal lengths in another unit.
+# Beyond these fields of view, a focal length in the wrong unit is more likely than such a lens.
 _WIDEST_DEG, _WIDEST_FISHEYE_DEG, _NARROWEST_DEG = 150, 240, 2
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Numbers of a scene; ``suspicions`` are sentences for a person."""
+    """Statistics of a scene; ``suspicions`` are human-readable warnings."""
 
     events: int
     width: int
@@ -43,9 +43,9 @@ class Summary:
     silent_pixel_share: float
     events_per_active_pixel: float
     busiest_pixel: tuple[int, int, int]
-    """Column, row, events."""
+    """Column, row and number of events."""
     hot_pixels: int
-    """Those that training leaves out for being far busier than usual."""
+    """Number of hot pixels, which training leaves out."""
     keyframes: int
     trajectory_start_us: int
     trajectory_end_us: int
@@ -57,16 +57,16 @@ class Summary:
     frames: int
     groundtruth: bool
     distortion: str
-    """Camera model where it distorts, else none."""
+    """The camera model if it has distortion, else none."""
     sensor: SensorFacts
-    """What the recording tells of its sensor."""
+    """Sensor properties estimated from the recording."""
     plan: list[Line]
-    """What training will use on this machine unless flags say otherwise."""
+    """The settings that training will use on this machine, unless overridden by flags."""
     suspicions: list[str] = field(default_factory=list)
 
 
 def inspect_scene(folder: Path) -> Summary:
-    """Read the whole scene; raises the reader's error for any file that training would stumble over."""
+    """Read the whole scene; raises the reader's error for any file that training could not use."""
     scene = read_scene(folder)
     trajectory = read_tum(scene.trajectory)
     check_bounds(scene, trajectory)
@@ -187,7 +187,7 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
 
 
 def _view(camera: Camera) -> list[str]:
-    """How wide the camera sees, where that is hardly what is meant."""
+    """Return a warning if the field of view is implausible."""
     sides = ((camera.width, camera.fx), (camera.height, camera.fy))
     fisheye = camera.model == "equidistant"
     angles = [degrees(side / focal) if fisheye else degrees(2 * atan2(side / 2, focal)) for side, focal in sides]
@@ -201,7 +201,7 @@ def _view(camera: Camera) -> list[str]:
 
 
 def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
-    """All events between two keyframes: a camera that moves on a straight line, or another unit of time."""
+    """Return a warning if all events lie between two keyframes: straight motion, or a wrong time unit."""
     if summary.end_us < summary.trajectory_start_us or summary.start_us > summary.trajectory_end_us:
         return []
     edges = torch.tensor([summary.start_us, summary.end_us], dtype=torch.int64)
@@ -219,7 +219,7 @@ def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
 
 
 def print_summary(summary: Summary, folder: Path) -> None:
-    """For a person: first what looks wrong."""
+    """Print the summary for people, warnings first."""
     console = print_facts(folder, summary.suspicions, _lines(summary))
     console.print("\nplan of training, which these flags of ns-train overrule:")
     for line in summary.plan:

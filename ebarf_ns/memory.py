@@ -1,4 +1,4 @@
-"""How much memory a run has taken."""
+"""Peak memory of a run."""
 
 import sys
 from pathlib import Path
@@ -12,13 +12,12 @@ except ImportError:  # Windows
 
 
 def peak_memory_mib(device: str = "cpu") -> float:
-    """Most memory held at once since the process began: on a GPU by torch, else by the process; 0 where the system does
-    not tell."""
+    """Peak memory since the process started: of torch on a GPU, else of the process; 0 if the system cannot tell."""
     if device.startswith("cuda"):
         return torch.cuda.max_memory_allocated() / 2**20
     status = Path("/proc/self/status")
     if status.is_file():
-        # What getrusage says includes the parent of a process, from before it became a program of its own.
+        # getrusage includes the memory of the parent process from before exec.
         lines = status.read_text(encoding="utf-8").splitlines()
         for line in lines:
             if line.startswith("VmHWM"):

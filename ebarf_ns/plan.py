@@ -38,7 +38,7 @@ _MOST_BLANK = 0.06
 
 @dataclass(frozen=True)
 class Line:
-    """One decision."""
+    """One decision of the plan."""
 
     field: str
     """Dotted path in the run's configuration."""

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "ebarf-scene", 1
 _LARGE_SHARE = 0.05
-# A trajectory this much longer than its recording, with no keyframes among the events, is in another unit of time.
+# A trajectory this much longer than its recording, with no keyframes among the events, is in another time unit.
 _LONGEST_SPAN_RATIO = 100
 _LONGEST_REFRACTORY_US = 1_000_000
 _LONGEST_TIME_CONSTANT_US = 1_000_000
-# Far beyond what there is: what is larger is a mistake, for which no memory is asked.
+# Far beyond real sensors: larger values are mistakes, for which no memory is allocated.
 _MOST_PIXELS, _MOST_SIDES, _MOST_EXTENT, _MOST_THRESHOLD = 1 << 26, 1e4, 1e9, 1e3
 _LATEST_US = 1 << 61
 _SENSOR_KEYS = "contrast_threshold refractory_us time_constant_us"
@@ -37,7 +37,7 @@ FrameIntensity = Literal["linear", "srgb", "log"]
 
 @dataclass(frozen=True)
 class ContrastThreshold:
-    """The change of log brightness that an event reports, per polarity."""
+    """The contrast thresholds in log brightness, per polarity."""
 
     on: float
     off: float
@@ -45,21 +45,21 @@ class ContrastThreshold:
 
 @dataclass(frozen=True)
 class Frame:
-    """A validation frame: never used for training."""
+    """A validation frame, never used for training."""
 
     path: Path
     t_us: int
     camera: Camera
     event_camera_from_frame_camera: tuple[tuple[float, ...], ...]
-    """4x4; identity where the event sensor itself took the frame."""
+    """4x4 transform; identity if the event sensor itself took the frame."""
     intensity: FrameIntensity
     depth: Path | None = None
-    """Distances along the pixels' rays in the reference's unit (npy), where somebody knows them."""
+    """Distances along the pixels' rays in the reference's unit (npy), if known."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a scene folder holds; paths are absolute or relative to the working directory, never to the folder."""
+    """The contents of a scene folder; paths are absolute or relative to the working directory, never to the folder."""
 
     folder: Path
     events: Path
@@ -69,19 +69,20 @@ class Scene:
     frames: tuple[Frame, ...] = ()
     contrast_threshold: ContrastThreshold | None = None
     refractory_us: int | None = None
-    """How long a pixel is blind after an event."""
+    """Refractory period of a pixel after an event."""
     time_constant_us: float | None = None
-    """Of the photoreceptor's low pass, at the mean log brightness of what is seen."""
+    """Time constant of the photoreceptor's low-pass filter at the mean log brightness of the scene."""
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner in world units."""
     missing: tuple[Path, ...] = ()
-    """Files of validation frames that are named and are not there; such frames, or depths, are left out."""
+    """Missing files of validation frames; such frames, or their depths, are left out."""
 
 
 def read_scene(folder: Path, trajectory_to_come: bool = False) -> Scene:
     """Read ``folder/scene.json``; raises :class:`SceneError` naming file, key, value and expectation.
 
-    Validation frames may be missing: nothing is learned from them. So may the trajectory, for who makes it.
+    Validation frames may be missing, since training does not use them; so may the trajectory with
+    ``trajectory_to_come``.
     """
     path = folder / "scene.json"
     if not folder.is_dir():
@@ -96,7 +97,7 @@ def read_scene(folder: Path, trajectory_to_come: bool = False) -> Scene:
     frames, missing = _read_frames(content.optional_file("frames", must_exist=False), camera)
     return Scene(
         folder=folder,
-        # A trained run can be viewed and exported when its recording is gone: whoever reads it complains.
+        # A trained run can be viewed and exported without its recording: a missing one is an error only when read.
         events=content.file("events", must_exist=False, absolute=True),
         trajectory=_trajectory(content, trajectory_to_come),
         camera=camera,
@@ -123,7 +124,7 @@ def _trajectory(content: JsonObject, to_come: bool) -> Path:
 
 
 def check_bounds(scene: Scene, trajectory: Trajectory) -> None:
-    """Raise :class:`SceneError` when the bounds hold none of the keyframes."""
+    """Raise :class:`SceneError` if no keyframe lies within the bounds."""
     if scene.bounds is None:
         return
     lower, upper = torch.tensor(scene.bounds, dtype=torch.float64)
@@ -136,15 +137,17 @@ def check_bounds(scene: Scene, trajectory: Trajectory) -> None:
 
 
 def box_of_bounds(bounds: Sequence[Sequence[float]]) -> tuple[Float[Tensor, "3"], float, Float[Tensor, "3"]]:
-    """Centre, scale and half sides of bounds: ``(x - centre) * scale`` has the longest side reach from -1 to 1."""
+    """Centre, scale and half sides of bounds: the longest side of ``(x - centre) * scale`` reaches from -1 to 1."""
     lower, upper = torch.tensor(bounds, dtype=torch.float64)
     scale = 2 / float((upper - lower).max())
     return (lower + upper) / 2, scale, (upper - lower) * scale / 2
 
 
 def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajectory) -> None:
-    """Raise :class:`SceneError` when events, of which the first and last time are given, and trajectory cannot be on
-    one clock, in one unit of time."""
+    """Raise :class:`SceneError` if events and trajectory cannot be on one clock in one time unit.
+
+    ``events_us`` are the times of the first and the last event.
+    """
     keyframe_t_us = trajectory.t_us.numpy()
     (start_us, end_us), (first_us, last_us) = events_us, keyframe_t_us[[0, -1]].tolist()
     among = int(((keyframe_t_us >= start_us) & (keyframe_t_us <= end_us)).sum())
@@ -163,13 +166,13 @@ def check_clocks(scene: Scene, events_us: tuple[int, int], trajectory: Trajector
 
 
 def events_left_out(outside: int, events: int) -> list[str]:
-    """Say which share of the events lies outside the trajectory's span, if it is large."""
+    """Return a warning if a large share of events lies outside the trajectory's span."""
     large = outside > _LARGE_SHARE * events
     return [f"{outside / events:.0%} of the events lie outside the trajectory's span and are left out"] if large else []
 
 
 def write_scene(scene: Scene) -> None:
-    """Write ``scene.json`` and, with frames, ``frames.json``; the files that they name are the caller's to write."""
+    """Write ``scene.json`` and, with frames, ``frames.json``; the caller writes the files that they name."""
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -189,12 +192,12 @@ def write_scene(scene: Scene) -> None:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """The path of a file as scene.json has it: from the folder, or absolute for files elsewhere."""
+    """The path of a file for scene.json: relative to the folder, or absolute for files elsewhere."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.resolve().as_posix()
 
 
 def write_camera(path: Path, camera: Camera) -> None:
-    """Write a camera as ``scene.json`` has it under "camera"."""
+    """Write a camera in the format of "camera" in ``scene.json``."""
     write_json(path, _camera_json(camera))
 
 
@@ -229,7 +232,7 @@ def _camera(content: JsonObject) -> Camera:
         raise content.wrong("width", f"at most {_MOST_PIXELS:,} pixels, with height {height:.6g}")
 
     def sides(key: str, positive: bool = False) -> float:
-        """A number of pixels that makes sense beside those of the sensor."""
+        """A length in pixels that is plausible for the sensor's size."""
         value, most = content.number(key, positive=positive), _MOST_SIDES * max(width, height)
         if abs(value) > most or (positive and value < 1 / _MOST_SIDES):
             raise content.wrong(key, f"{f'{1 / _MOST_SIDES} to ' if positive else 'within ±'}{most:.6g} pixels")
@@ -286,7 +289,7 @@ def _bounds(content: JsonObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _read_frames(path: Path | None, event_camera: Camera) -> tuple[tuple[Frame, ...], tuple[Path, ...]]:
-    """Those that are there, and the files that are not."""
+    """The frames whose files exist, and the missing files."""
     if path is None or not path.exists():
         return (), (path,) if path else ()
     content = read_json(path)

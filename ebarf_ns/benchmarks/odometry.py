@@ -1,4 +1,4 @@
-"""What trajectories from events alone are worth, against the truth that scenes have.
+"""Errors of trajectories estimated from events alone, against the ground truth of scenes.
 
 python -m ebarf_ns.benchmarks.odometry SCENE ... [--output FILE.json] makes the table of docs/odometry.md.
 """
@@ -26,7 +26,7 @@ from ebarf_ns.scene import Scene, read_scene
 
 
 def measured(folder: Path) -> dict[str, Any]:
-    """One scene's estimate, or why there is none, its errors, and seconds of it for one of the recording."""
+    """The record of one scene: its estimate or the failure, errors, and seconds of computation per recorded second."""
     scene = read_scene(folder, trajectory_to_come=True)
     _, first_us, last_us = RecordingFile(scene.events, scene.camera.width, scene.camera.height).span()
     record: dict[str, Any] = {"scene": folder.name, "length_s": (last_us - first_us) * 1e-6}
@@ -43,7 +43,7 @@ def measured(folder: Path) -> dict[str, Any]:
 
 
 def _errors(estimate: Estimate, scene: Scene) -> dict[str, float]:
-    """Positions as shares of the true path's extent: aligned by sim3 where that is defined, and by orientation."""
+    """Position errors as shares of the true path's extent, aligned by sim3 if defined, and by orientation."""
     if scene.groundtruth is None:
         return {}
     true = read_tum(scene.groundtruth)
@@ -57,7 +57,7 @@ def _errors(estimate: Estimate, scene: Scene) -> dict[str, float]:
 
 
 def table(records: list[dict[str, Any]]) -> str:
-    """Markdown, one line a recording."""
+    """A Markdown table with one row per recording."""
     rows = ["| recording | verdict | span | error | by halves | rotation | s per s |", "|---|---|---|---|---|---|---|"]
     for one in records:
         share = one.get("sim3_share", one.get("orientation_share"))
@@ -79,7 +79,7 @@ def _text(value: float | None, form: str) -> str:
 
 
 def main(scenes: Annotated[tuple[Path, ...], tyro.conf.Positional], output: Path | None = None) -> None:
-    """Measure scenes one after the other."""
+    """Measure scenes one after another."""
     with one_line_errors():
         records = [measured(folder) for folder in scenes]
     if output:

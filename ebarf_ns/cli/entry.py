@@ -1,4 +1,4 @@
-"""The first word of the ``ebarf`` command: what commands there are is said without the imports that they need."""
+"""Dispatch of the ``ebarf`` command: help and subcommand names need no heavy imports."""
 
 import signal
 import sys
@@ -10,13 +10,13 @@ COMMANDS = {
     "process": "make a scene of a recording, whatever wrote it",
     "inspect": "say what is in a scene or a recording, what looks wrong, and how it will be trained",
     "train": "train on a scene: ns-train ebarf --data SCENE, which has all the flags",
-    "evaluate": "a finished run's errors, and its report made anew",
+    "evaluate": "show a finished run's errors, and write its report again",
     "render": "pictures or a video along a run's trajectory, or the events that it predicts",
     "mesh": "a run's surfaces as a mesh",
     "points": "a run's surfaces as a point cloud",
     "trajectory": "estimate one from events alone, compare two, export a refined one, give one errors",
     "bench": "measure speed, or compare methods",
-    "replay": "do the step again that ended a training by bad numbers, and say where they begin",
+    "replay": "repeat the step whose bad numbers ended a training, and say where they begin",
 }
 _LINES = "\n".join(f"  {name:<12}{does}" for name, does in COMMANDS.items())
 _HELP = f"""\
@@ -49,7 +49,7 @@ def entrypoint() -> None:
 
         train(words[1:])
     elif words[0] in COMMANDS:
-        # As Ctrl-C does, it lets what is half written be removed.
+        # Like Ctrl-C, it raises an exception, so that partly written files are removed.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
         try:
             from ebarf_ns.cli.main import entrypoint as run

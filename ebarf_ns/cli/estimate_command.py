@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 
 @dataclass
 class TrajectoryEstimate:
-    """An initial trajectory from events alone, with points.ply and odometry.json beside it; or why there is none."""
+    """Estimate an initial trajectory from events alone, with points.ply and odometry.json, or say why it fails."""
 
     source: tyro.conf.Positional[Path]
     """A scene folder, with or without a trajectory, or a recording of any format."""
     camera: Path | None = None
-    """Of a recording: its calibration file."""
+    """For a recording: its calibration file."""
     camera_name: str | None = None
-    """Which camera of that file."""
+    """Name of the camera in that file."""
     part: str | None = None
-    """Of a recording: the group, topic or array that has the events, where several have."""
+    """For a recording: the group, topic or array of the events, if several have events."""
     output: Path | None = None
-    """The TUM file to write; trajectory.txt in the scene's folder, or here, where not given. It must not exist."""
+    """The TUM file to write; it must not exist. Default: trajectory.txt in the scene's or the current folder."""
     settings: tyro.conf.OmitArgPrefixes[OdometrySettings] = field(default_factory=OdometrySettings)
-    """How to go about it."""
+    """Settings of the estimation."""
 
     def run(self) -> None:
-        """Estimate, write, and say what the result is worth."""
+        """Estimate, write, and report the quality of the result."""
         from ebarf_ns.odometry.output import sentences, write_estimate
 
         stderr = Console(stderr=True)
@@ -56,7 +56,7 @@ class TrajectoryEstimate:
             stderr.print(sentence, soft_wrap=True)
 
     def _estimate(self, folder: Path, progress: Callable[[str], None]) -> tuple[Estimate, Path, Scene | None]:
-        """The estimate, where it goes, and the scene that it completes."""
+        """The estimate, its output path, and the scene that it completes, if any."""
         from ebarf_ns.formats.process import ProcessSettings, process
         from ebarf_ns.odometry.output import of_scene
         from ebarf_ns.scene import read_scene

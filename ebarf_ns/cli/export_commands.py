@@ -154,7 +154,7 @@ def _ply(path: Path) -> Path:
 @contextmanager
 def _opened(run_folder: Path, activity: str) -> "Iterator[tuple[FinishedRun, Callable[[float], None]]]":
     """Yield the finished run, and a function that reports progress from 0 to 1."""
-    # Of torch and nerfstudio, about their own code.
+    # Warnings of torch and nerfstudio about their own code.
     warnings.filterwarnings("ignore", category=FutureWarning)
     from ebarf_ns.nerf.finished_run import open_run
 

@@ -1,4 +1,4 @@
-"""``ebarf inspect``: what is in a scene or a recording, and what looks wrong."""
+"""``ebarf inspect``: the contents of a scene or a recording, and what looks wrong."""
 
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -15,18 +15,18 @@ from ebarf_ns.printing import print_json
 
 @dataclass
 class Inspect:
-    """What is in a scene folder, or in a recording of any format, and what looks wrong in it."""
+    """Show the contents of a scene folder or of a recording in any format, and what looks wrong."""
 
     scene: tyro.conf.Positional[Path]
     """A scene folder, or a recording."""
     picture: Path | None = None
-    """A PNG to make, with the events of some moments."""
+    """A PNG to write, with events at several times."""
     part: str | None = None
-    """Of a recording: the group of an HDF5 file or the topic of a bag that has the events, where several have."""
+    """For a recording: the HDF5 group or bag topic of the events, if several have events."""
     event_time_unit: TimeUnit | None = None
-    """Of a recording: the unit of its times, where it does not say so."""
+    """For a recording: the unit of its times, if it does not state it."""
     event_columns: str | None = None
-    """Of a recording: the order of columns without names, such as 'x y p t'."""
+    """For a recording: the order of unnamed columns, such as 'x y p t'."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -40,7 +40,7 @@ class Inspect:
             )
         if self.picture and self.picture.suffix.lower() != ".png":
             raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
-        # A folder that is neither is taken for a scene, and told what it lacks.
+        # A folder that is neither is treated as a scene, so that the error says what it lacks.
         if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
             summary = self._recording(self.scene)
         else:

@@ -30,7 +30,7 @@ _ALIGNED_BY = {"sim3": "similarity (sim3)", "se3": "rigid motion (se3)", "orient
 
 @dataclass
 class Simulate:
-    """Simulate an event camera moved by hand through a textured room: a scene folder with the truth beside it."""
+    """Simulate a handheld event camera in a textured room, and write a scene folder with ground truth."""
 
     output: tyro.conf.Positional[Path]
     """The scene folder to make."""
@@ -50,23 +50,23 @@ class Simulate:
 
 @dataclass
 class Process:
-    """Make a scene folder of a recording, whatever wrote it; the source is only read, what is left out is counted."""
+    """Make a scene folder from a recording in any known format; the source is only read, omissions are counted."""
 
     output: Path
     """The scene folder to make."""
     format: tyro.conf.Positional[Format] = "auto"
-    """What the source is; a dataset's folder or a recording's file is recognised where not given."""
+    """Format of the source; auto recognises dataset folders and recording files."""
     folder: tyro.conf.Positional[Path | None] = None
-    """The recording: a dataset's folder as it was downloaded, or a file."""
+    """The recording: a dataset's folder as downloaded, or a file."""
     source: Path | None = None
     """The same, as a flag."""
     config: Path | None = None
-    """A YAML file of flags, such as those in configs/ for public scenes; flags given beside it come first."""
+    """A YAML file of flags, such as those in configs/ for public scenes; flags on the command line override it."""
     settings: tyro.conf.OmitArgPrefixes[ProcessSettings] = field(default_factory=ProcessSettings)
-    """What the source does not say of itself."""
+    """Properties that the source does not state."""
 
     def run(self) -> None:
-        """Make the scene and say what is in it."""
+        """Make the scene and print its contents."""
         from ebarf_ns.formats.process import process
 
         refuse_existing(self.output)
@@ -89,19 +89,19 @@ class Process:
 
 @dataclass
 class TrajectoryCompare:
-    """Errors of a trajectory against a reference, in any of the formats that ebarf process reads.
+    """Errors of a trajectory against a reference, in any format that ebarf process reads.
 
-    Positions are compared after Umeyama's alignment, with the scale free (sim3) and as it is (se3), and after an
-    alignment by the rotations, which is defined for motion along a line too. Rotations are compared after the best
-    rotation of the world; if the estimate is of another body on the same rig, after one of the body as well.
+    Positions are compared after Umeyama's alignment with scale (sim3) and without (se3), and after an alignment by the
+    rotations, which is also defined for motion along a line. Rotations are compared after the best rotation of the
+    world and, for estimates of another body on the same rig, also of the body.
     """
 
     estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
     """The trajectory to judge."""
     reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
-    """The trajectory that it is compared with."""
+    """The trajectory to compare it with."""
     known: tyro.conf.OmitArgPrefixes[TrajectoryFormat] = field(default_factory=TrajectoryFormat)
-    """What the estimate's file does not say of itself."""
+    """Properties that the estimate's file does not state."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -116,7 +116,7 @@ class TrajectoryCompare:
             self._print(comparison)
 
     def _print(self, comparison: dict[str, Any]) -> None:
-        """A table with the alignments in rows; positions are in the reference's unit."""
+        """Print a table with one alignment per row; positions are in the reference's unit."""
         console = Console(highlight=False)
         console.print(
             f"[bold]{escape(str(self.estimate))}[/bold] against [bold]{escape(str(self.reference))}[/bold], "
@@ -135,12 +135,12 @@ class TrajectoryCompare:
 
 @dataclass
 class TrajectoryPerturb:
-    """Give a TUM file errors as odometry makes them: an imperfect trajectory for experiments."""
+    """Add odometry-like errors to a TUM file, as an imperfect trajectory for experiments."""
 
     source: tyro.conf.Positional[Path]
     output: tyro.conf.Positional[Path]
     errors: tyro.conf.OmitArgPrefixes[TrajectoryErrors] = field(default_factory=TrajectoryErrors)
-    """What is wrong with it, in the trajectory's own unit."""
+    """The errors to add, in the trajectory's own unit."""
     seed: int = 0
 
     def run(self) -> None:
@@ -156,7 +156,7 @@ class TrajectoryPerturb:
 
 @dataclass
 class Evaluate:
-    """A finished run's numbers from its folder, and its report made anew."""
+    """Show a finished run's results from its folder, and write its report again."""
 
     run_folder: tyro.conf.Positional[Path]
     """The folder with config.yml and metrics.jsonl."""
@@ -164,7 +164,7 @@ class Evaluate:
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
-        """Print the last evaluation and where the report is."""
+        """Print the last evaluation and the path of the report."""
         from ebarf_ns.evaluation.frames import lpips_note
         from ebarf_ns.evaluation.report import read_metrics, write_report
         from ebarf_ns.scene import read_scene
@@ -203,26 +203,26 @@ class Trajectory:
 
 @dataclass
 class Bench:
-    """Measure: engine is our speed beside nerfstudio's; recordings is how fast recordings are read; a manifest is a
-    comparison of methods, error against run time.
+    """Benchmark the engine's speed against nerfstudio's (engine), reading speed (recordings), or methods by error
+    against run time (a manifest).
 
-    A comparison can be stopped, and goes on where it stopped.
+    A stopped comparison resumes where it stopped.
     """
 
     what: tyro.conf.Positional[str]
     """engine, recordings, or a manifest such as configs/benchmarks/shipped.yaml."""
     engine: tyro.conf.OmitArgPrefixes[EngineBenchmark] = field(default_factory=EngineBenchmark)
-    """What to measure of the engine."""
+    """Settings of the engine benchmark."""
     recordings: tyro.conf.OmitArgPrefixes[RecordingsBenchmark] = field(default_factory=RecordingsBenchmark)
-    """How much to read."""
+    """Settings of the recordings benchmark."""
     output: Path | None = None
-    """Of engine and recordings: a JSON file for the figures. Of a comparison: the folder for scenes, runs, records and
-    diagrams; where not given, bench/ and the manifest's name."""
+    """For engine and recordings: a JSON file for the figures. For a comparison: the folder for scenes, runs, records
+    and diagrams. Default: bench/ and the manifest's name."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
-        """Measure, print, and keep."""
+        """Measure, print and save."""
         measure = {"engine": self._engine, "recordings": self._recordings}.get(self.what, self._comparison)
         result, shown = measure()
         if self.json:
@@ -272,8 +272,8 @@ _stderr = Console(stderr=True)
 
 
 def _with_config(words: list[str]) -> list[str]:
-    """The words of a command, those of the file that ``--config`` names before the others, which may overrule them."""
-    # "--config=FILE" is the same.
+    """A command's arguments; those from the ``--config`` file come first, so that the others override them."""
+    # "--config=FILE" is also accepted.
     split = [word.split("=", 1) if word.startswith("--config=") else [word] for word in words]
     words = [word for parts in split for word in parts]
     if words[:1] != ["process"] or "--config" not in words[:-1]:

@@ -10,10 +10,10 @@ import tyro
 
 @dataclass
 class Replay:
-    """Do the step again that ended a training by bad numbers, and say where they begin."""
+    """Repeat the step whose bad numbers ended a training, and say where they begin."""
 
     file: tyro.conf.Positional[Path]
-    """A replay-*.pt in a run's folder."""
+    """A replay-*.pt file in a run's folder."""
     json: bool = False
     """Print one JSON object and nothing else."""
 

@@ -1,4 +1,4 @@
-"""``ebarf train SCENE``: the short front of ``ns-train ebarf --data SCENE``."""
+"""``ebarf train SCENE``: short for ``ns-train ebarf --data SCENE``."""
 
 import os
 import shlex
@@ -22,16 +22,16 @@ and takes all flags of that command ("ns-train ebarf --help" lists them). Those 
   --output-dir FOLDER          where runs are kept, outputs/ where not given
   --vis tensorboard            no viewer: the command ends with the training
   --load-dir RUN/nerfstudio_models
-                               go on from a run's newest checkpoint
+                               resume from a run's newest checkpoint
 """
 
 
 def train(words: list[str]) -> None:
-    """Check the scene, which takes a moment where nerfstudio takes many, then run ns-train in this process."""
+    """Check the scene before the slow nerfstudio imports, then run ns-train in this process."""
     if words[:1] in (["-h"], ["--help"]):
         print(_HELP, end="")
         return
-    # Before torch is loaded: threads that wait for each other leave their cores to other programs.
+    # Set before torch is loaded, so that waiting threads leave their cores to other programs.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     with one_line_errors():
         if not words or words[0].startswith("-"):
@@ -44,7 +44,7 @@ def train(words: list[str]) -> None:
             raise EbarfError(
                 "no ns-train in this environment, expected nerfstudio 1.1.5: pip install nerfstudio==1.1.5"
             )
-    # Of torch and nerfstudio, about their own code.
+    # Warnings of torch and nerfstudio about their own code.
     warnings.filterwarnings("ignore", category=FutureWarning)
     sys.argv = command
     raise SystemExit(found.load()())
@@ -61,7 +61,7 @@ def _check(folder: Path) -> None:
         )
     scene = read_scene(folder, trajectory_to_come=True)
     if not scene.trajectory.is_file():
-        # Training makes one, and says so.
+        # Training estimates one, and says so.
         return
     trajectory = read_tum(scene.trajectory)
     check_bounds(scene, trajectory)

@@ -1,1 +1,1 @@
-"""What a run is worth: errors, held-out events, report."""
+"""Evaluation of runs: errors, held-out events, report."""

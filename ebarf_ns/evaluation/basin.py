@@ -1,4 +1,4 @@
-"""The basin of convergence: errors of trajectories after training against those before, over many trainings."""
+"""The basin of convergence: trajectory errors after training against those before, over many trainings."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 Record = dict[str, Any]
 
 _ERRORS = {"rotation_deg": "rotation error [deg]", "ate_m": "position error [m]"}
-# What is below is as good as exact.
+# Errors below these count as zero.
 _EXACT = {"rotation_deg": 0.02, "ate_m": 1e-4}
 _WORSE = 1.05
 
 
 def basin_figure(records: Sequence[Record]) -> Figure:
-    """One point for each training that refines its trajectory; below the diagonal it became better."""
+    """One point per training that refines its trajectory; points below the diagonal improved."""
     figure, axes = plt.subplots(1, len(_ERRORS), figsize=(9.0, 4.2))
     for axis, (name, title) in zip(axes, _ERRORS.items(), strict=True):
         scenes = list(dict.fromkeys(record["scene"] for record in records))
@@ -39,14 +39,14 @@ def basin_figure(records: Sequence[Record]) -> Figure:
 
 
 def worse_than_given(records: Sequence[Record]) -> list[Record]:
-    """Trainings that left positions or rotations that were not exact worse than they were, by more than a 20th."""
+    """Trainings that increased an error of positions or rotations, not counted as zero before, by more than 1/20."""
     pairs = [(record, name, _before_and_after(record, name)) for record in records for name in _ERRORS]
     worse = [record for record, name, pair in pairs if pair and pair[0] > _EXACT[name] and pair[1] > _WORSE * pair[0]]
     return [record for k, record in enumerate(worse) if record not in worse[:k]]
 
 
 def worse_lines(records: Sequence[Record]) -> list[str]:
-    """What :func:`worse_than_given` found, in Markdown, with what the runs themselves say of it."""
+    """The result of :func:`worse_than_given` in Markdown, with each run's own verdict."""
     worse = worse_than_given(records)
     lines = [
         f"{len(worse) or 'No'} training{'' if len(worse) == 1 else 's'} of {len(records)} left a trajectory worse."

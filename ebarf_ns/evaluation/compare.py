@@ -1,4 +1,4 @@
-"""Trajectories in files against each other, and which conventions a file follows, found by trying them."""
+"""Comparison of trajectory files, and detection of a file's conventions by trying them."""
 
 from dataclasses import replace
 from itertools import product
@@ -26,20 +26,20 @@ from ebarf_ns.formats.trajectory_formats import (
 )
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 
-# The right convention is better than all others by this factor, or the motion cannot tell.
+# A convention is accepted only if its error is below all others by this factor.
 _CLEARLY = 0.5
 _STILL_DEG = 0.01
-# No order of quaternions is doubted that fits to this.
+# A quaternion order that fits at least this well is not doubted.
 _GOOD_DEG = 2.0
-# Poses that are tried, of very many evenly.
+# Largest number of poses compared; longer trajectories are subsampled evenly.
 _MOST = 2000
 
 
 def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOTHING_KNOWN) -> dict[str, Any]:
-    """The errors of a trajectory against another under every alignment that is defined for them.
+    """The errors of a trajectory against a reference under every alignment that is defined.
 
-    The files are of any format that :func:`read_trajectory` knows; ``known`` is of the estimate. Raises
-    :class:`EvaluationError` where no alignment is defined.
+    The files may have any format that :func:`read_trajectory` supports; ``known`` describes the estimate. Raises
+    :class:`EvaluationError` if no alignment is defined.
     """
     true, notes = _reference(reference, estimate, known)
     estimated, said = read_beside_reference(estimate, true, known)
@@ -55,12 +55,12 @@ def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOT
 
 
 def _reference(path: Path, estimate: Path, known: TrajectoryFormat) -> tuple[Trajectory, list[str]]:
-    """Where it does not tell the unit of its times, the span of the estimate may."""
+    """Read the reference; if its time unit is not stated, the estimate's span is used to infer it."""
     try:
         return read_trajectory(path)
     except TrajectoryError as problem:
         try:
-            # Any order of quaternions will do for times.
+            # The times do not depend on the quaternion order.
             span_us = _span_us(read_trajectory(estimate, replace(known, quaternion=known.quaternion or "xyzw"))[0])
         except TrajectoryError:
             raise problem from None
@@ -73,10 +73,10 @@ def read_beside_reference(
     known: TrajectoryFormat = NOTHING_KNOWN,
     span_us: tuple[int, int] | None = None,
 ) -> tuple[Trajectory, list[str]]:
-    """A trajectory as it says itself, and where it does not say the order of its quaternions, as the reference does.
+    """Read a trajectory; if it does not state its quaternion order, find it by comparison with the reference.
 
-    The usual order stays unless another one fits clearly better. ``span_us`` is that of the events; of the reference
-    where not given.
+    The usual order is kept unless another one fits clearly better. ``span_us`` is the span of the events, by default
+    that of the reference. Also returns notes on what was found.
     """
     raw, span_us = read_raw(path, known), span_us or _span_us(reference)
     if order_is_doubtful(path, raw, known, span_us):
@@ -113,11 +113,11 @@ def read_beside_reference(
 def read_by_reference(
     path: Path, reference: Trajectory, known: TrajectoryFormat = NOTHING_KNOWN
 ) -> tuple[Trajectory, list[str]]:
-    """A trajectory read by the conventions under which its rotations are those of the reference.
+    """Read a trajectory with the conventions under which its rotations match the reference.
 
-    Order of the quaternion and direction of the transform are tried where ``known`` leaves them open, with any constant
-    rotation between the two bodies; then the axes, without. Raises :class:`TrajectoryError` where several orders fit
-    alike: then the motion cannot tell, and has to be told.
+    Quaternion order and transform direction are tried if ``known`` leaves them open, with any constant rotation between
+    the two bodies; then the axes, without it. Raises :class:`TrajectoryError` if several conventions fit equally well:
+    the motion then cannot distinguish them, and they must be given.
     """
     return _read_by_reference(path, read_raw(path, known), reference, known, _span_us(reference))
 
@@ -146,7 +146,7 @@ def _span_us(trajectory: Trajectory) -> tuple[int, int]:
 def _tried(
     path: Path, raw: RawPoses, reference: Trajectory, known: TrajectoryFormat, span_us: tuple[int, int]
 ) -> list[tuple[float, TrajectoryFormat]]:
-    """How far off every order and transform that is left open is, the best first."""
+    """Errors of all conventions that are left open, best first."""
     quaternions = (known.quaternion,) if known.quaternion else get_args(Quaternion)
     transforms = (known.transform,) if known.transform else get_args(Transform)
     tried: list[tuple[float, TrajectoryFormat]] = []
@@ -159,7 +159,10 @@ def _tried(
 def _note_on_order(
     path: Path, raw: RawPoses, reference: Trajectory, usual: TrajectoryFormat, span_us: tuple[int, int]
 ) -> list[str]:
-    """By rotations alone, which tell where the two bodies are one, and positions cannot."""
+    """Return a note if another quaternion order fits better, by rotations alone, since positions cannot be aligned.
+
+    Rotations can only tell if both trajectories are of the same body.
+    """
     tried = []
     try:
         for quaternion in get_args(Quaternion):
@@ -176,7 +179,7 @@ def _note_on_order(
 def _note_on_axes(
     path: Path, raw: RawPoses, reference: Trajectory, found: TrajectoryFormat, span_us: tuple[int, int]
 ) -> list[str]:
-    """Only where the two bodies are one do axes show; then those given should fit best."""
+    """Return a note if other axes fit better, which only shows if both trajectories are of the same body."""
     if found.axes:
         return []
     try:

@@ -1,4 +1,4 @@
-"""The records that a comparison of methods leaves, one per training, and what is read from them."""
+"""The records of a comparison of methods, one per training."""
 
 import math
 from collections.abc import Sequence
@@ -16,29 +16,29 @@ TOLERANCES = (0.1, 0.01, 0.001)
 
 
 def refining_records(result: dict[str, Any]) -> list[Record]:
-    """Those of methods that refine poses, baselines left out."""
+    """The records of methods that refine poses, without baselines."""
     return [record for record in result["records"] if result["roles"].get(record["method"], "method") == "method"]
 
 
 def error_of(evaluation: Record, name: str) -> float:
-    """One error of one evaluation, smaller is better; infinite where it is not known."""
+    """One error of an evaluation, smaller is better; infinite if unknown."""
     if name == "image":
         psnr = evaluation.get("psnr")
         return math.inf if psnr is None else 10 ** (-psnr / 20)
     value = evaluation.get(name)
     if value is None and name == "ate_m":
-        # Along a line only orientation and scale can be aligned.
+        # On a line, only orientation and scale can be aligned.
         value = evaluation.get("ate_m_orientation")
     return math.inf if value is None else float(value)
 
 
 def last_evaluation(record: Record) -> Record:
-    """The last evaluation; of a training that failed or that there is none of, nothing, which is infinitely bad."""
+    """The last evaluation; empty if the training failed or is missing, which counts as infinite error."""
     return record["evaluations"][-1] if record.get("evaluations") else {}
 
 
 def seconds_to(records: Sequence[Record], name: str, target: float) -> float:
-    """Training time after which an error is at most ``target`` in trainings of one problem; infinite where never."""
+    """Training time until an error is at most ``target`` in trainings of one problem; infinite if never reached."""
     reached = [
         evaluation["train_seconds"]
         for record in records
@@ -49,7 +49,7 @@ def seconds_to(records: Sequence[Record], name: str, target: float) -> float:
 
 
 def by_problem(records: Sequence[Record], *keys: str) -> dict[tuple, list[Record]]:
-    """Records grouped by some of what they are about, in order of appearance."""
+    """Records grouped by the given keys, in order of appearance."""
     groups: dict[tuple, list[Record]] = {}
     for record in records:
         groups.setdefault(tuple(record[key] for key in keys), []).append(record)
@@ -57,7 +57,7 @@ def by_problem(records: Sequence[Record], *keys: str) -> dict[tuple, list[Record
 
 
 def panels_of(records: Sequence[Record], roles: dict[str, str]) -> Panels:
-    """The records of each scene and trajectory; floors go into all panels of their scene."""
+    """The records of each scene and trajectory; floors appear in all panels of their scene."""
     floors = [record for record in records if roles.get(record["method"]) == "floor"]
     others = [record for record in records if roles.get(record["method"]) != "floor"]
     panels = by_problem(others, "scene", "trajectory")
@@ -68,6 +68,6 @@ def panels_of(records: Sequence[Record], roles: dict[str, str]) -> Panels:
 
 
 def quartiles(errors: Sequence[float]) -> Float[np.ndarray, "3"]:
-    """First quartile, median and third; infinite where a failed training takes part in them."""
+    """First quartile, median and third quartile; infinite where a failed training contributes."""
     found = np.quantile(np.minimum(errors, _HUGE), (0.25, 0.5, 0.75))
     return np.where(found > math.sqrt(_HUGE), math.inf, found)

@@ -26,7 +26,7 @@ _POSITION_TARGETS_M = (0.05, 0.02, 0.01, 0.005)
 
 
 def tables(result: dict[str, Any]) -> str:
-    """How good after each time, each seed against others, and how long to each target, as Markdown."""
+    """Markdown tables: errors after each time, methods against each other by seed, and time to each target."""
     panels = panels_of(result["records"], result["roles"])
     failed = [record for record in result["records"] if record.get("error")]
     count = f"{len(failed)} training{'s' if len(failed) > 1 else ''}" if failed else "No training"
@@ -60,8 +60,8 @@ def _ends(panels: Panels) -> list[str]:
 
 
 def _against_others(panels: Panels, roles: dict[str, str]) -> list[str]:
-    """What each training has over that of the same scene, trajectory, seed and time by the first method, and by the
-    floor, after all and after equally many steps, and which part of the trajectory's errors it left."""
+    """Differences in PSNR to the first method and to the floor, with equal scene, trajectory, seed and time, for the
+    floor also at equal steps; the share of trajectory errors left; and time per step relative to the first method."""
     first = next((method for method, role in roles.items() if role == "method"), "")
     floor = next((method for method, role in roles.items() if role == "floor"), "")
     lines = _head(
@@ -73,7 +73,7 @@ def _against_others(panels: Panels, roles: dict[str, str]) -> list[str]:
         for (method, seconds), own in by_problem(group, "method", "seconds").items():
             compared = []
             for record in own:
-                # Nothing is told of the first method against itself.
+                # The first method is not compared with itself.
                 by_first = {} if method == first else by_name.get((first, record["seed"], seconds), {})
                 by_floor = by_name.get((floor, record["seed"], seconds), {})
                 compared.append(_compared(record, by_first, by_floor))
@@ -94,7 +94,7 @@ def _compared(record: Record, by_first: Record, by_floor: Record) -> list[float]
 
 
 def _psnr_over_at_equal_steps(record: Record, other: Record) -> float:
-    """After the most steps that both have had, on straight lines over log(steps) between evaluations."""
+    """PSNR difference at the largest step count of both, interpolated linearly over log(steps)."""
     curves = _psnr_over_log_steps(record), _psnr_over_log_steps(other)
     if not all(log_steps for log_steps, _ in curves):
         return math.nan
@@ -133,12 +133,12 @@ def _seconds_a_step(evaluation: Record) -> float:
 
 
 def _ratio(error: float, other: float) -> float:
-    """Unknown where the other one is as good as nothing, as errors of true poses are."""
+    """Ratio of two values; NaN if the second is close to zero, as errors of true poses are."""
     return error / other if other > AS_GOOD_AS_NOTHING else math.nan
 
 
 def _spread(values: Sequence[float]) -> str:
-    """Median and quartiles, where all of them are known."""
+    """Median and quartiles as text; "-" unless all values are known."""
     if not np.isfinite(values).all():
         return "-"
     low, middle, high = quartiles(values)

@@ -1,6 +1,6 @@
 """Error against run time over many trainings: work-precision diagrams, performance profiles, time to target.
 
-Everything here is a function of the records that a comparison leaves.
+All diagrams are functions of the records of a comparison.
 """
 
 import itertools
@@ -63,9 +63,9 @@ def write_diagrams(result: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def performance_profile(seconds: Mapping[str, Sequence[float]], factors: Sequence[float]) -> dict[str, list[float]]:
-    """Share of the problems that each method solves within a factor of the fastest one's time (Dolan, Moré 2002).
+    """Share of problems that each method solves within a factor of the fastest one's time (Dolan, Moré 2002).
 
-    ``seconds`` has each method's time for every problem, in the same order, infinite where it fails.
+    ``seconds`` has each method's times for all problems, in the same order, infinite for failures.
     """
     best = np.min(list(seconds.values()), axis=0)
     with np.errstate(invalid="ignore"):
@@ -75,7 +75,7 @@ def performance_profile(seconds: Mapping[str, Sequence[float]], factors: Sequenc
 
 
 def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
-    """One row for each scene and trajectory, one column for each error."""
+    """One row per scene and trajectory, one column per error."""
     panels = panels_of(records, roles)
     shape = (max(1, len(panels)), len(_ERRORS))
     figure, axes = plt.subplots(*shape, figsize=(4 * shape[1], 3.2 * shape[0]), squeeze=False)
@@ -90,7 +90,7 @@ def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
         for axis, (name, title) in zip(axes[row], _ERRORS.items(), strict=True):
             for (method,), own in by_problem(group, "method").items():
                 if name in POSE_ERRORS and roles.get(method) == "floor":
-                    # Poses that are given as they are say nothing here.
+                    # Methods that keep the given poses have no pose error to show.
                     continue
                 _draw_curve(axis, own, name, colours[method], _STYLES[roles.get(method, "method")], method)
             given = [error_of(record["initial"], name) for record in group if record["trajectory"] == trajectory]
@@ -110,13 +110,13 @@ def _work_precision(records: Sequence[Record], roles: dict[str, str]) -> Figure:
 
 
 def _first_seconds(records: Sequence[Record]) -> set[float]:
-    """Where the faint way of the longest training begins."""
+    """Times at which the faint curves of the longest trainings start."""
     longest = max(records, key=lambda record: record["seconds"])
     return {round(evaluation["train_seconds"], 1) for evaluation in longest["evaluations"][:1]}
 
 
 def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, style: str, label: str) -> None:
-    """Where trainings of each length end, median and quartiles of the seeds; faintly, the way of the longest there."""
+    """Final errors of trainings of each length, median and quartiles over seeds; faint: the longest one's progress."""
     ends = {
         seconds: [error_of(last_evaluation(record), name) for record in group]
         for (seconds,), group in sorted(by_problem(records, "seconds").items())
@@ -138,7 +138,7 @@ def _draw_curve(axis: Axes, records: Sequence[Record], name: str, colour: Any, s
 
 
 def _profiles(records: Sequence[Record]) -> Figure:
-    """Share of scenes, trajectories and seeds solved to a tolerance, over the time that the fastest takes."""
+    """Share of scenes, trajectories and seeds solved to a tolerance, over time relative to the fastest method."""
     errors = {"ate_m": "position error", "heldout_event_loss": "unexplained events"}
     figure, axes = plt.subplots(len(errors), len(TOLERANCES), figsize=(12, 6.4), squeeze=False)
     problems = by_problem(
@@ -166,7 +166,7 @@ def _profiles(records: Sequence[Record]) -> Figure:
 
 
 def _target(group: Sequence[Record], name: str, tolerance: float) -> float:
-    """best + tolerance * (initial - best), the best of any method."""
+    """best + tolerance * (initial - best), with the best error of any method."""
     best = min((error_of(one, name) for record in group for one in record["evaluations"]), default=math.inf)
     initial = 1.0 if name == "heldout_event_loss" else error_of(group[0]["initial"], name)
     if not math.isfinite(best):

@@ -1,4 +1,4 @@
-"""Validation frames as linear radiance and depth, and how well renders match them."""
+"""Validation frames as linear radiance and depth, and errors of renders against them."""
 
 import os
 from collections.abc import Sequence
@@ -45,8 +45,8 @@ def read_frame(frame: Frame) -> Float[np.ndarray, "height width"]:
 
 
 def read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
-    """Grey as the file has it, 0 to 1 for integer formats; raises :class:`EvaluationError`."""
-    # OpenCV reads EXR only when asked to; it looks here at its first image.
+    """Grey values as stored, 0 to 1 for integer formats; raises :class:`EvaluationError`."""
+    # OpenCV reads EXR only if this is set before its first image.
     os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
     try:
         pixels = np.load(path, allow_pickle=False) if path.suffix == ".npy" else read_picture(path)
@@ -61,7 +61,7 @@ def read_pixels(path: Path) -> Float[np.ndarray, "height width"]:
 
 
 def read_depth(frame: Frame) -> Float[np.ndarray, "height width"] | None:
-    """Distances along the pixels' rays in the reference's unit, where known; raises :class:`EvaluationError`."""
+    """Distances along the pixels' rays in the reference's unit, None if unknown; raises :class:`EvaluationError`."""
     if frame.depth is None:
         return None
     try:
@@ -77,7 +77,7 @@ def read_depth(frame: Frame) -> Float[np.ndarray, "height width"] | None:
 def depth_error(
     rendered: Float[np.ndarray, "height width"], reference: Float[np.ndarray, "height width"]
 ) -> float | None:
-    """Mean of |rendered - true| / true over the pixels whose true depth is known (the field's AbsRel)."""
+    """Mean of |rendered - true| / true over pixels with known true depth (AbsRel)."""
     known = np.isfinite(reference) & (reference > 0)
     return float(np.mean(np.abs(rendered - reference)[known] / reference[known])) if known.any() else None
 
@@ -85,12 +85,12 @@ def depth_error(
 def fit_brightness(
     rendered_log: list[Float[np.ndarray, "height width"]], reference: list[Float[np.ndarray, "height width"]]
 ) -> tuple[list[Float[np.ndarray, "height width"]], bool]:
-    """Renders as linear radiance after one affine fit in log brightness over the whole set; and whether it is inverted.
+    """Renders as linear radiance after one affine fit in log brightness over the whole set, and whether it is inverted.
 
-    Events leave gain and offset of log brightness open: log reference ~ a * rendered_log + b, least squares over the
-    pixels where the reference is neither black nor, at 1, as white as its format can say. The gain is positive: a
-    render that is bright where the references are dark is inverted, and shown and judged as it is, with the references'
-    mean and contrast.
+    Events do not determine gain and offset of log brightness: log reference ~ a * rendered_log + b is fitted by least
+    squares over pixels where the reference is neither black nor saturated (1). The gain is positive: if the renders are
+    bright where the references are dark, they are inverted, and keep their sign but get the references' mean and
+    contrast.
     """
     x = np.concatenate([image.ravel() for image in rendered_log])
     y = np.concatenate([image.ravel() for image in reference])
@@ -110,11 +110,11 @@ def fit_brightness(
 def log_correlation(
     fitted: Float[np.ndarray, "height width"], reference: Float[np.ndarray, "height width"]
 ) -> dict[str, float]:
-    """Correlation of the log brightness of a fitted render and a linear reference, whole and high-passed.
+    """Correlation of the log brightness of a fitted render and a linear reference, unfiltered and high-passed.
 
-    High-passed by taking away a Gaussian blur with a standard deviation of 16 and of 4 pixels: shading across the
-    picture, which events hardly tell, then counts for little or nothing. What is blacker than 5/255 of the reference's
-    format counts as that black. 0 where either picture is flat.
+    The high-pass subtracts a Gaussian blur with a standard deviation of 16 or 4 pixels, so that shading across the
+    image, which events hardly determine, counts little or not at all. Values below 5/255 of the reference's format are
+    clipped to it. 0 if either image is flat.
     """
     ours, theirs = (np.log(np.maximum(image, _BLACK)) for image in (fitted, reference))
     found = {"log_correlation": _correlation(ours, theirs)}
@@ -135,8 +135,8 @@ def image_errors(
 ) -> dict[str, float]:
     """Mean PSNR, SSIM, LPIPS and log correlation of log-brightness renders against linear references, after the fit.
 
-    The first three are on [0, 1]. LPIPS (Zhang et al. 2018, AlexNet) is not among them where :func:`lpips_missing` says
-    why, nor SSIM where a frame is smaller than its window. ``inverted`` is 1 where the render is, else 0.
+    The first three are computed on [0, 1]. LPIPS (Zhang et al. 2018, AlexNet) is omitted if :func:`lpips_missing` gives
+    a reason, and SSIM if a frame is smaller than its window. ``inverted`` is 1 for inverted renders, else 0.
     """
     from torchmetrics.functional.image import (
         learned_perceptual_image_patch_similarity,
@@ -165,14 +165,14 @@ def image_errors(
 
 
 def lpips_note(evaluation: dict[str, Any]) -> str | None:
-    """Why an evaluation on record has no LPIPS, in a sentence; None where it has, or has no frames at all."""
+    """A sentence on why a recorded evaluation has no LPIPS; None if it has, or has no frames."""
     if "psnr" not in evaluation or evaluation.get("lpips") is not None:
         return None
     return lpips_missing() or f"{_FRAMES_TOO_SMALL}, or {_WEIGHTS_CAME_LATER}"
 
 
 def lpips_missing(reference: Sequence[Float[np.ndarray, "height width"]] = ()) -> str | None:
-    """Why LPIPS cannot be had, in a sentence; None where it can. Nothing is fetched from anywhere."""
+    """A sentence on why LPIPS is unavailable; None if it is available. Nothing is downloaded."""
     weights = Path(torch.hub.get_dir()) / "checkpoints" / "alexnet-owt-7be5be79.pth"
     if not weights.is_file():
         fetch = "import torchvision; torchvision.models.alexnet(weights='DEFAULT')"

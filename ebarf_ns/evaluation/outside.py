@@ -1,4 +1,4 @@
-"""What another program made of a scene, from its files alone."""
+"""Evaluation of another program's result on a scene, from its files."""
 
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,9 @@ _DARKEST = 1e-4
 
 
 def evaluate_files(scene: Scene, refined: Path, renders: Path | None) -> dict[str, Any]:
-    """Errors of a trajectory and, where given, of pictures named like the scene's frames, by the rules of our own runs.
+    """Errors of a trajectory and, if given, of renders named like the scene's frames, computed as for our own runs.
 
-    Pictures are linear in intensity; those of frames outside the trajectory's span count like the others. Raises
+    Renders are linear in intensity; those of frames outside the trajectory's span count like the others. Raises
     :class:`EvaluationError`.
     """
     results: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""A run's folder as one page that needs nothing else: verdict, trajectories, renders, events, numbers, plan."""
+"""The report of a run, a self-contained HTML page: verdict, trajectories, renders, events, numbers, plan."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _runs_below(folder: Path) -> str:
 
 
 def write_report(run: Path, groundtruth: Path | None) -> Path:
-    """Write ``run/report/report.html`` from the run's files, its figures beside it, and return the page."""
+    """Write ``run/report/report.html`` and its figures from the run's files, and return the page's path."""
     header, evaluations = read_metrics(run)
     reference = read_tum(groundtruth) if groundtruth else None
     initial, refined = (read_tum(run / f"trajectory_{name}.txt") for name in ("initial", "refined"))
@@ -118,7 +118,7 @@ def _svg(figure: Figure) -> str:
 
 
 def _moved(initial: Trajectory, refined: Trajectory) -> tuple[float, float] | None:
-    """How far the trajectory was moved, root mean square: share of its extent, and degrees; None for too few poses."""
+    """RMS correction of the trajectory: share of its extent, and degrees; None for too few poses."""
     shared = initial.t_us[within_span(initial.t_us, refined.t_us)]
     if len(shared) < 3:
         return None
@@ -184,7 +184,7 @@ def _support(last: Record) -> str:
 
 
 def _numbers(evaluations: list[Record], given: Record) -> str:
-    """What is measured in rows, evaluations in columns, the trajectory as given before them where it was judged."""
+    """A table with metrics in rows and evaluations in columns; the given trajectory comes first, if evaluated."""
     rows, judged = [], any(isinstance(given.get(name), int | float) for name in _NAMES)
     for name, (words, form) in _NAMES.items():
         values = [record.get(name) for record in ((given, *evaluations) if judged else evaluations)]
@@ -193,7 +193,7 @@ def _numbers(evaluations: list[Record], given: Record) -> str:
             rows.append(f"<tr><td>{words}{''.join(f'<td>{value}' for value in shown)}")
     heads = "".join(f"<th>{name}" for name in ("", *["as given"] * judged, *range(1, len(evaluations)), "last"))
     every = _text(json.dumps(evaluations[-1], indent=1))
-    # Where the weights should be is this machine's affair.
+    # Omit the path of the weights, which is specific to this machine.
     note = (lpips_note(evaluations[-1]) or "").split(" are not at ")[0]
     return (
         f"<div class=scroll><table><tr>{heads}{''.join(rows)}</table></div>{f'<p>{_text(note)}</p>' if note else ''}"

@@ -1,4 +1,4 @@
-"""The figures of a run's report, each from the run's own files."""
+"""The figures of a run's report, made from the run's files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LARGEST_EVENTS = 4
 
 
 class Drawn(NamedTuple):
-    """A trajectory with the colour and line of the paper's Fig. 2; in the reference's frame where there is one."""
+    """A trajectory with the colour and line style of the paper's Fig. 2, in the reference's frame if there is one."""
 
     name: str
     colour: str
@@ -45,7 +45,7 @@ class Drawn(NamedTuple):
 
 
 def drawn(initial: Trajectory, refined: Trajectory, reference: Trajectory | None) -> list[Drawn]:
-    """What training began with, what it ended with, and the truth where it is known."""
+    """The initial and the refined trajectory, and the reference if known."""
     styles: list[tuple[Trajectory, str, str, dict[str, Any]]] = [
         (initial, "initial", "tab:blue", {"lw": 0.8, "marker": ".", "ms": 3}),
         (refined, "refined", "tab:orange", {"lw": 2}),
@@ -65,7 +65,7 @@ def drawn(initial: Trajectory, refined: Trajectory, reference: Trajectory | None
 
 
 def within(one: Trajectory, other: Trajectory) -> Trajectory:
-    """The poses in the span of another trajectory."""
+    """The poses within the span of another trajectory."""
     inside = (one.t_us >= other.t_us[0]) & (one.t_us <= other.t_us[-1])
     return Trajectory(one.t_us[inside], Poses(*(column[inside] for column in one.poses)))
 
@@ -86,7 +86,7 @@ def views_figure(trajectories: list[Drawn]) -> Figure:
 
 
 def axes_figure(trajectories: list[Drawn]) -> Figure:
-    """Position and rotation over time, axis by axis; rotations each from its own first pose."""
+    """Position and rotation over time, per axis; rotations are relative to each trajectory's first pose."""
     figure, axes = plt.subplots(2, 3, figsize=(9, 4.5), sharex=True)
     for one in trajectories:
         turns_deg = np.degrees((one.rotation[0].inv() * one.rotation).as_rotvec())
@@ -105,7 +105,7 @@ def axes_figure(trajectories: list[Drawn]) -> Figure:
 
 
 def errors_figure(initial: Trajectory, refined: Trajectory, reference: Trajectory) -> Figure | None:
-    """Position and rotation errors over time, initial and refined; None where they cannot be aligned."""
+    """Position and rotation errors over time, initial and refined; None if they cannot be aligned."""
     before, after = (errors_over_time(one, reference) for one in (initial, refined))
     if before is None or after is None:
         return None
@@ -125,7 +125,7 @@ def errors_figure(initial: Trajectory, refined: Trajectory, reference: Trajector
 def curves_figure(evaluations: list[Record]) -> Figure:
     """Errors over training time."""
     names = [name for name in CURVES if any(record.get(name) is not None for record in evaluations)]
-    # Of motion along a line there is no other than by orientation.
+    # For motion along a line, only the alignment by orientation is defined.
     names = [name for name in names if name != "ate_m_orientation" or "ate_m" not in names]
     rows = max(1, -(-len(names) // 2))
     figure, axes = plt.subplots(rows, 2, figsize=(7, 2.4 * rows), squeeze=False)
@@ -144,7 +144,7 @@ def curves_figure(evaluations: list[Record]) -> Figure:
 
 
 class Moments(NamedTuple):
-    """Events of some windows of time: recorded, and predicted by the field; sums of polarities per pixel."""
+    """Recorded and predicted events of some time windows, as sums of polarities per pixel."""
 
     t_us: np.ndarray
     width_us: np.ndarray
@@ -153,7 +153,7 @@ class Moments(NamedTuple):
 
 
 def read_moments(path: Path) -> Moments | None:
-    """None where the run left none."""
+    """Read the moments of a run; None if it has none."""
     if not path.is_file():
         return None
     with np.load(path, allow_pickle=False) as file:
@@ -161,7 +161,7 @@ def read_moments(path: Path) -> Moments | None:
 
 
 def moments_figure(moments: Moments) -> Figure:
-    """Recorded, predicted and the difference, one row for each window."""
+    """Recorded events, predicted events and their difference, one row per window."""
     count = len(moments.t_us)
     height, width = moments.recorded.shape[1:]
     figure, axes = plt.subplots(count, 3, figsize=(9, 3 * count * height / width + 0.3 * count), squeeze=False)
@@ -196,8 +196,8 @@ def _correlation(recorded: np.ndarray, predicted: np.ndarray) -> float:
 
 
 def with_error_map(path: Path) -> tuple[bytes, float]:
-    """A picture of render and reference side by side, as a PNG with the error between them as a third, and PSNR in dB
-    as it is shown."""
+    """A PNG of render, reference and error side by side, made from one of render and reference; and the PSNR [dB] of
+    the displayed values."""
     grey = read_picture(path, cv2.IMREAD_GRAYSCALE)
     assert grey is not None
     render, reference = np.split(grey, 2, axis=1)

@@ -1,4 +1,4 @@
-"""How far a trajectory is from a reference, through the evo library."""
+"""Errors of a trajectory against a reference, computed with the evo library."""
 
 import warnings
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from ebarf_ns.errors import EvaluationError
 from ebarf_ns.geometry.so3 import quat_wxyz_multiply, rotate
 from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_span
 
-# Motion across the main direction below this share of that along it counts as a line.
+# Motion counts as a line if its extent across the main direction is below this share of that along it.
 _THINNEST = 0.01
 _ALTERNATIONS = 20
 Alignment = Literal["se3", "sim3", "orientation"]
 ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
-"""How results say which alignment a number is of."""
+"""Suffix of a result's name for each alignment."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class TrajectoryError:
     """Errors after one alignment of the estimate to the reference."""
 
     ate_m: float
-    """Root mean square of the position errors."""
+    """RMS position error."""
     rotation_deg: float
-    """Root mean square of the rotation errors after the best world rotation, which is their own, not that of ate_m."""
+    """RMS rotation error after the world rotation that fits the rotations best, not that of ate_m."""
     rotation_deg_body: float
-    """The same, after one constant rotation of the body is solved for as well."""
+    """The same, with a constant rotation of the body also fitted."""
     ape_full: float
     """Mean of evo's unit-less full transformation error, the number of the E-BARF paper's Table 2."""
     scale: float
@@ -46,8 +46,8 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     """Compare at the estimate's times within the reference's span, where the reference is interpolated.
 
     ``se3`` and ``sim3`` align the positions (Umeyama 1991). ``orientation`` rotates by the mean difference of the
-    rotations and fits place and scale, which is defined for motion along a line too. Raises :class:`EvaluationError`
-    where the alignment is not defined: fewer than 3 poses, no motion, or for Umeyama's a line.
+    rotations and fits position and scale, which is also defined for motion along a line. Raises
+    :class:`EvaluationError` if the alignment is undefined: fewer than 3 poses, no motion, or for Umeyama's a line.
     """
     estimated, true = _matched(estimate, reference)
     turned, straight = _rotations(estimated), _rotations(true)
@@ -70,7 +70,7 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
 
 
 def _umeyama(estimated: PosePath3D, true: PosePath3D, correct_scale: bool) -> tuple[np.ndarray, np.ndarray, float]:
-    """Align in place; positions on a line leave the turn about it open, whatever their noise says of it."""
+    """Align in place; raises :class:`EvaluationError` for positions on a line, which leave rotations about it open."""
     for path in (estimated, true):
         extent = np.linalg.svd(path.positions_xyz - path.positions_xyz.mean(axis=0), compute_uv=False)
         if extent[1] <= _THINNEST * extent[0]:
@@ -124,8 +124,8 @@ def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
 def rotation_errors_by_positions_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
     """Rotation errors in the world to which the positions are aligned, without and with one rotation for the body.
 
-    Of a quaternion's columns in another order, some are the right rotations up to another world and another body: only
-    the positions tell them apart. Raises :class:`EvaluationError` where they are on a line.
+    Some wrong quaternion orders give rotations that are right up to a rotation of world and body; only the positions
+    distinguish them. Raises :class:`EvaluationError` if the positions are on a line.
     """
     estimated, true = _matched(estimate, reference)
     turned = _rotations(estimated)
@@ -139,7 +139,7 @@ def _spread_deg(rotations: Rotation) -> float:
 
 
 def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> float:
-    """RMSE of true = world * estimate * body with the best world rotation, and if asked for with the best body one."""
+    """RMSE of true = world * estimate * body with the best world rotation and, if requested, the best body rotation."""
     body = _body(estimate, true) if with_body else Rotation.identity()
     world = (true * (estimate * body).inv()).mean()
     for _ in range(_ALTERNATIONS if with_body else 0):
@@ -149,13 +149,13 @@ def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> 
 
 
 def _body(estimate: Rotation, true: Rotation) -> Rotation:
-    """The body's rotation from relative ones, which know no world: their axes differ by it (hand-eye calibration)."""
+    """The body rotation from relative rotations, which do not depend on the world (hand-eye calibration)."""
     lag = max(1, len(estimate) // 10)
     of_estimate, of_true = ((path[:-lag].inv() * path[lag:]).as_rotvec() for path in (estimate, true))
     if min(np.linalg.norm(of_estimate), np.linalg.norm(of_true)) < 1e-9:
         return Rotation.identity()
     with warnings.catch_warnings():
-        # Turns about one axis leave the turn about that axis open, which the alternation then finds.
+        # Rotations about a single axis leave the rotation about it open; the alternation then finds it.
         warnings.simplefilter("ignore")
         return Rotation.align_vectors(of_estimate, of_true)[0]
 
@@ -182,7 +182,7 @@ def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, P
 
 
 def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.ndarray, "keyframes 3"]:
-    """The estimate's positions aligned by orientation and scale, for plots; as they are where that is not defined."""
+    """The estimate's positions aligned by orientation and scale, for plots; unchanged if that is undefined."""
     try:
         estimated, true = _matched(estimate, reference)
         _align_by_orientation(estimated, true)
@@ -192,9 +192,9 @@ def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.n
 
 
 def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
-    """What results say of a trajectory: its errors under each alignment, None where one is not defined.
+    """The results of a trajectory: its errors under each alignment, None where it is undefined.
 
-    Rotations have an error wherever 3 poses match, also about a camera that stays where it is.
+    The rotation error needs only 3 matching poses, even without translation.
     """
     errors, _ = errors_under_each_alignment(estimate, reference)
     try:
@@ -211,7 +211,7 @@ def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str,
 def errors_under_each_alignment(
     estimate: Trajectory, reference: Trajectory
 ) -> tuple[dict[Alignment, TrajectoryError], dict[Alignment, str]]:
-    """The errors where an alignment is defined, and where it is not the reason."""
+    """The errors of each defined alignment, and the reason for each undefined one."""
     errors, reasons = {}, {}
     for alignment in ALIGNMENTS:
         try:
@@ -223,7 +223,7 @@ def errors_under_each_alignment(
 
 @dataclass(frozen=True)
 class ErrorsOverTime:
-    """Pose by pose, after one alignment of positions (sim3, else by orientation and scale) and one of rotations."""
+    """Errors per pose, after one alignment of positions (sim3, else by orientation and scale) and one of rotations."""
 
     t_us: Int64[np.ndarray, "poses"]
     position_m: Float[np.ndarray, "poses"]
@@ -231,7 +231,7 @@ class ErrorsOverTime:
 
 
 def errors_over_time(estimate: Trajectory, reference: Trajectory) -> ErrorsOverTime | None:
-    """How far each pose within the reference's span is off; None where no alignment is defined."""
+    """The error of each pose within the reference's span; None if no alignment is defined."""
     try:
         estimated, true = _matched(estimate, reference)
         turned, straight = _rotations(estimated), _rotations(true)
@@ -254,8 +254,8 @@ def errors_over_time(estimate: Trajectory, reference: Trajectory) -> ErrorsOverT
 def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_us: Int64[Tensor, "times"]) -> Poses:
     """The reference's poses at ``t_us``, moved into the estimate's world by the inverse of the sim3 alignment.
 
-    For frames outside the estimate's span. Along a line the alignment is that by orientation. Raises
-    :class:`EvaluationError` where that is not defined either, and for times outside the reference's span.
+    For frames outside the estimate's span. For motion along a line, it aligns by orientation. Raises
+    :class:`EvaluationError` if that is undefined too, and for times outside the reference's span.
     """
     outside = t_us[~within_span(t_us, reference.t_us)]
     if len(outside):

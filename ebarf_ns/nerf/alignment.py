@@ -46,7 +46,7 @@ _WARM_UP = 5
 _CLOCK_EVERY, _LEAST_CLOCK_PX = 100, 0.2
 # A clock offset from the event rate is only tested if it is large and its correlation clear.
 _LEAST_ACTIVITY_US, _LEAST_CORRELATION, _LEAST_GAIN = 40_000, 0.5, 0.05
-NOT_ALIGNED = "trajectory: large errors are not looked for, which takes a longer training than this"
+NOT_ALIGNED = "trajectory: not checked for large errors, which needs a longer training"
 _SOME_BEARINGS, _SOME_EVENTS = 50, 5_000_000
 _CLOCK_STEPS, _CLOCK_DEVIATIONS = 100, 3.0
 

@@ -169,7 +169,7 @@ def unsealed(pipeline: dict[str, Tensor], what: str) -> dict[str, Tensor]:
     if stored is not None and not (isinstance(stored, Tensor) and stored.tolist() == checksum(state)):
         raise TrainingError(f"{what}: is damaged: its checksum is not that of its content; expected a whole checkpoint")
     if name := not_finite(state):
-        raise TrainingError(f"{what}: holds values that are not finite, in {name}; expected a checkpoint of before")
+        raise TrainingError(f"{what}: holds values that are not finite, in {name}; expected an earlier checkpoint")
     return state
 
 

@@ -149,7 +149,7 @@ def _scene_folder(config: EbarfDataParserConfig) -> Path:
         return folder
     if config.kept is None or not (config.kept / "scene.json").is_file():
         raise SceneError(moved(config))
-    sys.stderr.write(f"opened by the run's own {config.kept}, without frames and recording ({moved(config)})\n")
+    sys.stderr.write(f"opened with the run's copy {config.kept}, without frames and recording ({moved(config)})\n")
     return config.kept
 
 

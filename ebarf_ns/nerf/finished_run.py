@@ -79,7 +79,7 @@ def open_run(folder: Path) -> FinishedRun:
     config = read_run_config(folder / "config.yml")
     checkpoint, damaged = newest_whole(folder / "nerfstudio_models")
     for error in damaged:
-        sys.stderr.write(f"{error}; {checkpoint.name} is taken\n")
+        sys.stderr.write(f"{error}; {checkpoint.name} is used instead\n")
     state = read_checkpoint(checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:

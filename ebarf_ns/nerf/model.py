@@ -1,4 +1,4 @@
-"""The picture of the method: event pair, two poses, two rays, two intensities, one difference, one loss."""
+"""The method in one file: event pair, two poses, two rays, two intensities, one difference, one loss."""
 
 from dataclasses import dataclass, field
 from math import log, sqrt
@@ -28,13 +28,13 @@ from ebarf_ns.radiance.ray_sampling import Rays
 from ebarf_ns.radiance.renderer import Renderer, Sampling
 from ebarf_ns.scene import Scene
 
-# Log brightness is known up to a factor, which the field can follow: 0.1 or 0.6 in place of 0.25 cost 1 to 2 dB.
+# Log brightness is known up to a factor, which the field adapts to; 0.1 or 0.6 instead of 0.25 cost 1 to 2 dB.
 _UNKNOWN_THRESHOLD = 0.25
 T = TypeVar("T")
 
 
 def _planned(value: T | None) -> T:
-    """A value that the trainer's plan has filled in."""
+    """A value that the plan must have set; raises :class:`TrainingError` if it is None."""
     if value is None:
         raise TrainingError("this run's config.yml lacks values of its plan: it is of an earlier version of ebarf_ns")
     return value
@@ -45,7 +45,7 @@ class EbarfModelConfig(ModelConfig):
     """An event-loss NeRF that corrects its own trajectory."""
 
     _target: type = field(default_factory=lambda: EbarfModel)
-    # nerfstudio's, of which nothing here makes use: no flags that would do nothing.
+    # nerfstudio's fields that have no effect here, hidden from the flags.
     enable_collider: tyro.conf.Suppress[bool] = False
     collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
     loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
@@ -53,67 +53,66 @@ class EbarfModelConfig(ModelConfig):
     eval_num_rays_per_chunk: int = 4096
     camera_optimizer: TrajectoryOptimizerConfig = field(default_factory=TrajectoryOptimizerConfig)
     loss: Literal["threshold", "normalized"] = "threshold"
-    """Eq. 5, with thresholds taken as equal where the scene does not give them; or the paper's Eq. 6."""
+    """threshold: Eq. 5, with a default threshold if the scene states none; normalized: the paper's Eq. 6."""
     huber_delta: Annotated[float | None, tyro.conf.arg(aliases=old_names("--pipeline.model.huber-delta"))] = 0.3
-    """Error of a pair, in its standard deviations, beyond which its size counts, not its square; None: all squares."""
+    """Huber delta: errors of pairs beyond this many standard deviations count linearly; None: squared loss."""
     render_variance: float = 5.0
-    """With Eq. 5: of the change between two renders, over what one event adds to a pair's; both weigh against it."""
+    """With Eq. 5: variance of a pair's render error, in units of one event's variance; both reduce a pair's weight."""
     threshold_ratio: float | None = None
-    """With Eq. 5: C_on / C_off; None: as the scene states it, else as counted in the recording."""
+    """With Eq. 5: C_on / C_off; None: as stated in the scene, else as estimated from the recording."""
     threshold_deviation: float | None = None
-    """With Eq. 5: relative deviation of that ratio, within which training refines it; 0: it stands; None: 0 where the
-    ratio is stated, else as counted."""
+    """With Eq. 5: relative standard deviation of that ratio, which training refines; 0: fixed; None: 0 if the ratio is
+    stated, else as estimated."""
     learn_intrinsics: tyro.conf.Suppress[bool] = False
     """Set by the trainer to --learn-intrinsics."""
     threshold_prior: float = 0.01
-    """What a ratio one deviation off costs, where a render wrong by a threshold costs 1."""
+    """Loss of a ratio that is one standard deviation off, where a render error of one threshold costs 1."""
     time_constant_us: float | None = None
-    """With Eq. 5: of the photoreceptor, at mean brightness; 0: no delay; None: as the scene states it, else learned."""
+    """With Eq. 5: time constant of the photoreceptor at mean brightness; 0: no delay; None: as stated, else learned."""
     time_constant_prior: float = 0.001
-    """What each of its milliseconds costs, where a render wrong by a threshold costs 1: delay that poses could as well
-    explain is theirs."""
+    """Loss per millisecond of the time constant, where a render error of one threshold costs 1; a delay that the poses
+    explain as well is left to them."""
     brightness: BrightnessKind = "log"
-    """Log brightness of an intensity: lin_log is Eq. 2."""
+    """How log brightness is computed from intensity; lin_log: Eq. 2."""
     intensity_range: IntensityRange = "positive"
-    """Of the field: unit is a sigmoid, positive an exponential."""
+    """Activation of the field's intensity; unit: sigmoid, positive: exponential."""
     view_dependent: bool = False
     """Let intensity depend on the viewing direction."""
     contract: bool | None = None
-    """Let the grid hold all of space, contracted, or the scene's bounds alone; None: as planned."""
+    """True: the grid covers all of space, contracted; False: only the scene's bounds; None: as planned."""
     grid_levels: int | None = None
-    """Resolutions of the hash grid; None: as planned."""
+    """Levels of the hash grid; None: as planned."""
     grid_features: int = 4
     grid_coarsest: int = 8
     grid_finest: int | None = None
     """Cells per side of the finest level; None: as planned."""
     grid_table_size_log2: int | None = None
-    """Rows of the table a level; None: as planned."""
+    """Log2 of the table rows per level; None: as planned."""
     broad_cells: int | None = None
-    """Cells per side of the finest of the lattices for low-frequency log brightness; 0: none; None: as
-    planned."""
+    """Cells per side of the finest lattice for low-frequency log brightness; 0: none; None: as planned."""
     sampling: Literal["importance", "uniform"] = "importance"
-    """Where along a ray the field is asked: where the remembered density is, or everywhere evenly (the paper)."""
+    """Samples along a ray: importance: where the remembered density is; uniform: evenly spaced, as in the paper."""
     samples: int | None = None
-    """Points per ray at which the field is asked; None: as planned."""
+    """Field evaluations per ray; None: as planned."""
     coarse_samples: int = Sampling.coarse_samples
     """Points per ray at which the remembered density is looked up for importance sampling."""
     uniform_share: float = Sampling.uniform_share
-    """Share of the importance samples that is spread evenly, so that nothing stays unseen."""
+    """Share of the importance samples that is spread evenly, so that no region is missed."""
     most_hidden: float = Sampling.most_hidden
-    """Share of what is behind it that an interval remembered as dense may hide from the samples; 1: all of it."""
+    """Largest share of what is behind it that a dense interval may occlude in sample placement; 1: all of it."""
     density_cells: int | None = None
     """Cells per side of the remembered density; None: as planned."""
     near: float = Sampling.near
-    """Distance at which rays begin, in units of half the scene's size (without bounds: four times the trajectory's)."""
+    """Distance at which rays begin, in half scene sizes (without bounds: in four times the trajectory's radius)."""
     precision: Precision | None = None
-    """Of the MLPs' products; None: as planned."""
+    """Precision of the MLPs' matrix products; None: as planned."""
     exposure: float = 0.0
-    """Of the output rgb: brighter by so many stops."""
+    """Brightens the output rgb by this many stops."""
     gamma: float = 1.0
-    """Of the output rgb: more than 1 lifts the shadows."""
+    """Gamma of the output rgb; above 1 lifts the shadows."""
 
     def __getattr__(self, name: str) -> Any:
-        # All that ns-export marching-cubes does before its traceback is to look for this.
+        # ns-export marching-cubes reads this attribute first, and would end in a traceback.
         if name == "sdf_field":
             with one_line_errors():
                 raise TrainingError("ns-export marching-cubes is for signed distance fields; expected ebarf mesh RUN")
@@ -121,17 +120,17 @@ class EbarfModelConfig(ModelConfig):
 
 
 class EbarfModel(Model):
-    """Renders rays, and compares the two ends of each event pair."""
+    """Renders rays and compares the two ends of each event pair."""
 
     config: EbarfModelConfig
 
     def populate_modules(self) -> None:
-        """Build what the scene needs and nothing else."""
+        """Build the modules that the scene needs."""
         super().populate_modules()
         config, scene = self.config, self.kwargs["metadata"]["scene"]
         assert isinstance(scene, Scene)
         self.normalized = config.loss == "normalized"
-        # The paper's Eq. 6 takes polarities as they are, and knows no scale that a ratio could be learned in.
+        # The paper's Eq. 6 uses raw polarities and has no scale in which a ratio could be learned.
         given = scene.contrast_threshold
         ratio, deviation = _planned(config.threshold_ratio), _planned(config.threshold_deviation)
         if self.normalized:
@@ -178,14 +177,14 @@ class EbarfModel(Model):
         )
         self.intrinsics = Intrinsics(scene.camera) if config.learn_intrinsics else None
         self.register_buffer("display_range", torch.tensor([-1.0, 1.0]), persistent=False)
-        """Log brightness that is shown as black and as white."""
+        """Log brightness shown as black and as white."""
         self.display_range: Tensor
         self.exposure, self.gamma = config.exposure, config.gamma
         self.normals: SurfaceNormals | None = None
         self.random = torch.Generator()
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """Two groups: fields, with what is learned of the sensor, and camera_opt for the keyframe corrections."""
+        """Groups: fields, with the sensor's parameters; camera_opt for keyframe corrections; intrinsics, if learned."""
         groups = {"fields": [*self.renderer.parameters(), *self.sensor.parameters()]}
         self.camera_optimizer.get_param_groups(groups)
         if self.intrinsics:
@@ -193,13 +192,13 @@ class EbarfModel(Model):
         return groups
 
     def pose_parameters(self) -> list[torch.nn.Parameter]:
-        """What says where the rays of events run: all that is learned but the field and the sensor."""
+        """The parameters that determine event rays: all but those of the field and the sensor."""
         return [one for name, group in self.get_param_groups().items() if name != "fields" for one in group]
 
     def begin_step(self, step: int, seed: int) -> None:
-        """Random numbers are a function of seed and step, so that a resumed run continues as if never stopped.
+        """Seed random numbers by seed and step, so that a resumed run continues as if never stopped.
 
-        Each process of several has a seed of its own; what the first one remembers of densities goes for all.
+        In distributed training, each process has its own seed, and all use the first one's remembered density.
         """
         self.random.manual_seed(seed * 1_000_003 + step)
         self.renderer.begin_step(step, self.random)
@@ -207,8 +206,8 @@ class EbarfModel(Model):
         self.sensor.begin_step(step)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Rendered intensity, depth and accumulation, a grey picture of the log brightness for people, what the sensor
-        is taken to be, and of a finished run the surfaces' normals, in nerfstudio's [0, 1]."""
+        """Rendered intensity, depth, accumulation, log brightness and its grey image for display; sensor parameters;
+        for a finished run also surface normals, mapped to [0, 1] as in nerfstudio."""
         if self.intrinsics and "event_pixel" in (ray_bundle.metadata or {}):
             ray_bundle.directions = self.intrinsics.bearings(ray_bundle.metadata.pop("event_pixel")[:, 0])
         self._look_back(ray_bundle)
@@ -223,14 +222,13 @@ class EbarfModel(Model):
             "brightness": brightness[:, None],
             "depth": rendered.depth[:, None],
             "accumulation": rendered.accumulation[:, None],
-            # Training in several processes asks that what is learned takes part in this.
+            # Distributed training requires all learned parameters to take part in the forward pass.
             "sensor": self.sensor(),
             **normals,
         }
 
     def _look_back(self, ray_bundle: RayBundle) -> None:
-        """A photoreceptor that lags behind shows at an event's time what was there before: how long before goes by how
-        bright it is."""
+        """Set the photoreceptor's delay of each event ray, which depends on the brightness seen."""
         t_us = (ray_bundle.metadata or {}).get("event_t_us")
         if t_us is None or not self.sensor.delays:
             return
@@ -241,7 +239,7 @@ class EbarfModel(Model):
         ray_bundle.metadata["delay_us"] = self.sensor.delay_us(brightness)
 
     def get_loss_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None) -> dict:
-        """The change of log brightness between the two rays of each pair, against what its events report."""
+        """Compare the rendered change of log brightness between the rays of each pair with that reported by events."""
         before, after = outputs["brightness"][:, 0].chunk(2)
         change = after - before
         reported = reported_change(batch["polarity_sum"], batch["event_count"], *outputs["sensor"]).to(change)
@@ -265,7 +263,7 @@ class EbarfModel(Model):
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """How opaque the scene is, what the sensor is taken to be, and how far the keyframes have moved."""
+        """Mean accumulation, sensor parameters, and how far the keyframes have moved."""
         metrics = {"accumulation": outputs["accumulation"].detach().mean()}
         if self.sensor.learns_time_constant:
             metrics["time_constant_us"] = self.sensor.time_constant_us.detach()
@@ -275,18 +273,18 @@ class EbarfModel(Model):
         return metrics
 
     def grey(self, brightness: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels"]:
-        """Log brightness for people, in [0, 1]."""
+        """Log brightness mapped to [0, 1] for display."""
         low, high = self.display_range
         return ((brightness + log(2) * self.exposure - low) / (high - low)).clamp(0, 1) ** (1 / self.gamma)
 
     def fit_display_range(self, brightness: Float[Tensor, "rays"]) -> None:
-        """Show log brightness as whole views have it: all but a thousandth at either end."""
+        """Set the display range to that of these rays, without a thousandth at either end."""
         low, high = torch.quantile(brightness.float(), brightness.new_tensor([0.001, 0.999]))
         seen = torch.stack([low, torch.maximum(high, low + 0.1)])
         self.display_range.copy_(seen.where(seen.isfinite().all(), self.display_range))
 
     def show_normals(self) -> None:
-        """Render normals from now on, of the field as it is now."""
+        """Also render normals from now on, computed from the current field."""
         self.normals = SurfaceNormals(self.renderer)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
@@ -294,7 +292,7 @@ class EbarfModel(Model):
         return torch.cat([outputs[output_name], outputs["accumulation"]], dim=-1)
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; a dataset's own cameras are rendered from where the refined trajectory puts them."""
+        """Render a camera; cameras of the dataset are first moved to their refined poses."""
         moved = camera[...]
         moved.camera_to_worlds = self.camera_optimizer.apply_to_camera(camera).detach()
         return super().get_outputs_for_camera(moved, obb_box)
@@ -302,7 +300,7 @@ class EbarfModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Pictures for nerfstudio's logs; the numbers come from the pipeline, over all frames at once."""
+        """Images for nerfstudio's logs; the pipeline computes the metrics over all frames at once."""
         depth = outputs["depth"] / outputs["depth"].amax()
         reference = batch["image"].to(outputs["rgb"])
         return {}, {"img": torch.cat([reference, outputs["rgb"]], dim=1), "depth": depth.expand(-1, -1, 3)}

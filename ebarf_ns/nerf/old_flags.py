@@ -1,4 +1,4 @@
-"""Flags under the names that they had before: they work for one more version."""
+"""Former names of flags, which work for one more version."""
 
 import sys
 from collections.abc import Sequence
@@ -6,19 +6,17 @@ from collections.abc import Sequence
 OLD_FLAGS = {
     "--pipeline.model.outliers-from": "--pipeline.model.huber-delta",
 }
-"""Old name to new; a name goes one version after it came here."""
+"""Old name to new name; an entry is removed one version after it was added."""
 
 
 def old_names(flag: str) -> list[str]:
-    """Those of a flag, for tyro's ``aliases``."""
+    """The former names of a flag, for tyro's ``aliases``."""
     return [old for old, new in OLD_FLAGS.items() if new == flag]
 
 
 def warn_of_old_flags(words: Sequence[str]) -> None:
-    """One line on standard error for each old name among a command's words."""
+    """Print a warning to standard error for each former name among a command's arguments."""
     for word in words:
         old = word.split("=", 1)[0].replace("_", "-")
         if old in OLD_FLAGS:
-            sys.stderr.write(
-                f"warning: {old} is now called {OLD_FLAGS[old]}; the old name goes with the next version\n"
-            )
+            sys.stderr.write(f"warning: {old} is now called {OLD_FLAGS[old]}; the next version removes the old name\n")

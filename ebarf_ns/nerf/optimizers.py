@@ -1,4 +1,4 @@
-"""What steps the parameters: optimizers, and schedules that follow a budget."""
+"""Optimizers, and learning rate schedules that follow a budget."""
 
 from dataclasses import dataclass, field
 
@@ -22,29 +22,29 @@ class FusedAdamConfig(OptimizerConfig):
 
 @dataclass
 class KeyframeAdamConfig(OptimizerConfig):
-    """Adam with a second moment over the six numbers of a keyframe's correction, and of whole stretches'."""
+    """Adam with a full-matrix second moment for the six numbers of a keyframe's correction, and for whole stretches."""
 
     _target: type = KeyframeAdam
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-3
-    """Share of a keyframe's mean second moment that is added to that of every direction."""
+    """Share of a keyframe's mean second moment that is added to each eigenvalue."""
     coupled: bool = True
-    """Scale rotation and shift together, so that what tells them apart is followed; else each number by itself."""
+    """Scale rotation and shift jointly, so that they are told apart; if False, scale each number separately."""
     stretches: bool = True
-    """Move stretches of the trajectory too, as drift bends them; else each keyframe for itself alone."""
+    """Also move whole stretches of the trajectory, as drift bends them; if False, move each keyframe alone."""
 
 
 @dataclass
 class BudgetDecayConfig(SchedulerConfig):
-    """Exponential decay over the budget of the run, whether it is counted in steps or in seconds."""
+    """Exponential decay over the budget of the run, counted in steps or in seconds."""
 
     _target: type = field(default_factory=lambda: BudgetDecayScheduler)
     lr_final_ratio: float = 0.1
-    """Learning rate at the end over that at the start."""
+    """Ratio of the final to the initial learning rate."""
 
 
 class BudgetDecay(LambdaLR):
-    """Follows ``progress``, the used fraction of the budget, which the trainer sets before every step."""
+    """Decays with ``progress``, the used fraction of the budget, which the trainer sets before every step."""
 
     progress: float = 0.0
 
@@ -53,10 +53,10 @@ class BudgetDecay(LambdaLR):
 
 
 class BudgetDecayScheduler(Scheduler):
-    """Makes :class:`BudgetDecay`."""
+    """Creates :class:`BudgetDecay` schedules."""
 
     config: BudgetDecayConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> BudgetDecay:
-        """The scheduler of one optimizer."""
+        """The schedule of one optimizer."""
         return BudgetDecay(optimizer, self.config.lr_final_ratio)

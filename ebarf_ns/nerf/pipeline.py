@@ -29,7 +29,7 @@ from ebarf_ns.nerf.terminal import say
 from ebarf_ns.nerf.upgrades import completed
 from ebarf_ns.scene import Frame, Scene
 
-# nerfstudio's own, once a training step or a camera; there is nothing that a user could do about them.
+# nerfstudio's own warnings, repeated for every step or camera; users can do nothing about them.
 warnings.filterwarnings("ignore", message=".*GradScaler.*is deprecated", category=FutureWarning)
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
 warnings.filterwarnings("ignore", message="Converting a tensor with requires_grad=True to a scalar")
@@ -39,13 +39,13 @@ _DISPLAY_RAYS = 8192
 
 @dataclass
 class EbarfPipelineConfig(VanillaPipelineConfig):
-    """Event pairs into an event-loss model."""
+    """Trains an event-loss model on event pairs."""
 
     _target: type = field(default_factory=lambda: EbarfPipeline)
 
 
 class EbarfPipeline(VanillaPipeline):
-    """Seeds every step by its number, and evaluates by the rules: frames at the refined pose of their time."""
+    """Seeds every step by its number; evaluates frames at the refined pose of their time."""
 
     datamanager: EventDataManager  # pyright: ignore[reportIncompatibleVariableOverride]
     model: EbarfModel  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -58,18 +58,18 @@ class EbarfPipeline(VanillaPipeline):
             else:
                 self._say_what_changed()
         self.upgraded: list[str] = []
-        """Names that the checkpoint lacked which was loaded, if any: it is of an earlier version."""
+        """Names that the loaded checkpoint lacked because it is from an earlier version."""
         self.last_loss: Tensor | None = None
-        """Of the last training step's event pairs."""
+        """Event loss of the last training step."""
         self.register_buffer("cost", torch.zeros(2, dtype=torch.float64))
         self.cost: Tensor
 
     def record_cost(self, train_seconds: float, event_pairs: int) -> None:
-        """What the model has cost so far; kept in its checkpoints, so that ns-eval can say it."""
+        """Record the training cost so far; it is stored in checkpoints, so that ns-eval can report it."""
         self.cost.copy_(torch.tensor([train_seconds, event_pairs], dtype=self.cost.dtype))
 
     def _check_references(self) -> None:
-        """Read what evaluation will need, so that a mistake in it does not end a run halfway."""
+        """Read all references for evaluation, so that a bad file does not end a run halfway."""
         for frame in self.scene.frames:
             read_frame(frame)
             read_depth(frame)
@@ -77,7 +77,7 @@ class EbarfPipeline(VanillaPipeline):
             read_tum(self.scene.groundtruth)
 
     def _say_what_changed(self) -> None:
-        """To evaluate or show a run by another scene than it was trained on may be right, and may be a mistake."""
+        """Warn if the scene is not the one that the run was trained on, which may be intended or a mistake."""
         kept = self.datamanager.config.dataparser.kept  # pyright: ignore[reportAttributeAccessIssue]
         if kept and self.scene.events.is_file() and self.scene.folder != kept:
             for part in changed_parts(self.scene, read_header(kept.parent)):
@@ -98,25 +98,25 @@ class EbarfPipeline(VanillaPipeline):
 
     @property
     def seed(self) -> int:
-        """Of this process among those that train together."""
+        """The random seed of this process; in distributed training, each has its own."""
         return self.datamanager.config.seed * self.world_size + self.datamanager.rank
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
-        """One training step's outputs, losses and metrics."""
+        """Outputs, losses and metrics of one training step."""
         self.model.begin_step(step, self.seed)
         outputs, losses, metrics = super().get_train_loss_dict(step)
         self.last_loss = losses["event_loss"].detach()
         return outputs, losses, metrics
 
     def trajectory(self, refined: bool = True) -> Trajectory:
-        """The keyframes, refined or as they came, in the input's world frame and scale."""
+        """The keyframes, refined or as given, in the input's world frame and scale."""
         optimizer = self.model.camera_optimizer
         keyframes = optimizer.trajectory() if refined else optimizer.given_trajectory()
         world = self._normalization.invert(keyframes)
         return Trajectory(world.t_us.cpu(), world.poses)
 
     def write_refined(self, path: Path) -> None:
-        """Write the refined trajectory in TUM format; comments say what was done to its times."""
+        """Write the refined trajectory in TUM format; comments report inserted keyframes and a clock offset."""
         comments, given, refined = [], self.trajectory(refined=False), self.trajectory()
         if inserted := len(refined.t_us) - len(given.t_us):
             comments.append(f"inserted keyframes: {inserted}")
@@ -126,7 +126,7 @@ class EbarfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def numbers(self) -> dict[str, Any]:
-        """What can be said of a training at any time: held-out events, corrections, and errors against a reference."""
+        """Results available at any time in training: held-out events, corrections, and errors against a reference."""
         training = self.model.training
         self.model.eval()
         results = {**self._heldout(), **self._corrections(), **self._trajectory_errors()[0]}
@@ -135,7 +135,7 @@ class EbarfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def _corrections(self) -> dict[str, float]:
-        """Root mean squares over the keyframes of how far training has moved them, positions in the input's unit."""
+        """RMS distance and rotation by which training has moved the keyframes; distance in the input's unit."""
         optimizer = self.model.camera_optimizer
         given, refined = optimizer.initial(), optimizer.keyframes()
         moved = (refined.position - given.position).square().sum(dim=-1).mean().sqrt() / self._normalization.scale
@@ -144,9 +144,9 @@ class EbarfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def evaluate(self, renders: Path | None = None) -> dict[str, Any]:
-        """Held-out event loss and, where the scene has references, image, depth and trajectory errors.
+        """Held-out event loss and, if the scene has references, image, depth and trajectory errors.
 
-        With ``renders``, each frame is written there beside its reference as a PNG.
+        With ``renders``, each rendered frame is written there beside its reference as a PNG.
         """
         self.eval()
         self.fit_display_range()
@@ -154,11 +154,11 @@ class EbarfPipeline(VanillaPipeline):
         results = {**self._heldout(), **self._image_errors(renders, scale), **trajectory_errors}
         results |= {**self._corrections(), **self._keyframes()}
         self.train()
-        # JSON knows no NaN.
+        # JSON has no NaN.
         return {name: None if value != value else value for name, value in results.items()}
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Take the parameters of a checkpoint that is whole; what nerfstudio's scripts load comes this way too."""
+        """Load the parameters of a checkpoint after verifying it; nerfstudio's scripts load through this method too."""
         with one_line_errors():
             what = f"step-{step:09d}.ckpt"
             state, self.upgraded = completed(unsealed(loaded_state, what), self.state_dict(), what)
@@ -172,7 +172,7 @@ class EbarfPipeline(VanillaPipeline):
             self.fit_display_range()
 
     def _refined(self, cameras: Cameras) -> Cameras:
-        """Cameras where training has put them, which nothing moves again: they have no time."""
+        """Cameras at their refined poses, without times, so that they are not moved again."""
         refined = cameras[...]
         refined.camera_to_worlds = self.model.camera_optimizer.apply_to_camera(cameras).detach()
         refined.metadata = {}
@@ -182,14 +182,14 @@ class EbarfPipeline(VanillaPipeline):
 
     @torch.no_grad()
     def fit_display_range(self) -> None:
-        """Let pictures for people show what there is in whole views."""
+        """Set the display range from random rays of whole views."""
         training = self.model.training
         self.model.eval()
         self.model.fit_display_range(self.model(self.datamanager.view_rays(_DISPLAY_RAYS, 0))["brightness"][:, 0])
         self.model.train(training)
 
     def _heldout(self) -> dict[str, float | None]:
-        """How well held-out events are predicted, and the contrast thresholds by which they would be best."""
+        """How well held-out events are predicted, and the contrast thresholds that fit them best."""
         if not self.scene.events.is_file() or not len(self.datamanager.heldout_pairs):
             return {"heldout_event_loss": None}
         rays, batch = self.datamanager.next_eval(0)
@@ -205,7 +205,7 @@ class EbarfPipeline(VanillaPipeline):
         }
 
     def _keyframes(self) -> dict[str, float]:
-        """What was found of the trajectory's times."""
+        """The number of inserted keyframes and, if learned, the clock offset."""
         optimizer = self.model.camera_optimizer
         inserted = len(optimizer.keyframe_t_us) - len(optimizer.given)
         if not optimizer.learns_clock:
@@ -218,12 +218,12 @@ class EbarfPipeline(VanillaPipeline):
         }
 
     def _threshold_ratio(self) -> float:
-        """C_on / C_off as stated, or as counted in the recording: the same for every method and setting."""
+        """C_on / C_off as stated, else as estimated from the recording; the same for every method and setting."""
         stated = self.scene.contrast_threshold
         return stated.on / stated.off if stated else self.datamanager.facts.threshold_ratio.value
 
     def _image_errors(self, renders: Path | None, scale_to_reference: float | None) -> dict[str, float | None]:
-        """Frames at the refined pose of their time, and apart from them those outside the trajectory's span."""
+        """Errors of frames at their refined poses, and separately of frames outside the trajectory's span."""
         optimizer = self.model.camera_optimizer
         keyframe_t_us = optimizer.keyframe_t_us.cpu()
         within, outside = [], []
@@ -233,7 +233,7 @@ class EbarfPipeline(VanillaPipeline):
         results: dict[str, float | None] = {}
         if within:
             t_us = torch.tensor([frame.t_us for frame in within])
-            # Placed along the initial trajectory, from where the model moves them along with the refined one.
+            # Placed along the initial trajectory; the model then moves them to their refined poses.
             poses = Poses(*(column.cpu() for column in optimizer.initial_at(t_us.to(optimizer.keyframe_t_us))))
             cameras = frame_cameras(within, Trajectory(t_us, poses), self._mount_scale)
             results |= self._compare(within, cameras, scale_to_reference, renders)
@@ -245,14 +245,14 @@ class EbarfPipeline(VanillaPipeline):
         return results
 
     def _as_learned(self, frame: Frame) -> Frame:
-        """A frame of the event camera itself has the intrinsics that were learned for it."""
+        """The frame with the learned intrinsics if the event camera itself took it."""
         intrinsics = self.model.intrinsics
         return (
             replace(frame, camera=intrinsics.refined()) if intrinsics and frame.camera == self.scene.camera else frame
         )
 
     def _placed_by_reference(self, frames: list[Frame]) -> tuple[list[Frame], Cameras] | None:
-        """Those within the reference's span, and their cameras."""
+        """The frames within the reference's span, and their cameras placed by the reference."""
         if self.scene.groundtruth is None:
             return None
         reference = read_tum(self.scene.groundtruth)
@@ -266,7 +266,7 @@ class EbarfPipeline(VanillaPipeline):
             return None
         placed = self._normalization.apply(Trajectory(t_us, poses))
         cameras = frame_cameras(frames, placed, self._mount_scale)
-        # Without their times, cameras are not moved along with the refined trajectory.
+        # Without times, cameras are not moved with the refined trajectory.
         cameras.metadata = {}
         return frames, cameras
 
@@ -299,7 +299,7 @@ class EbarfPipeline(VanillaPipeline):
         }
 
     def _trajectory_errors(self) -> tuple[dict[str, Any], float | None]:
-        """Errors under each alignment, and the scale that takes the trajectory's unit to the reference's."""
+        """Errors under each alignment, and the scale from the trajectory's unit to the reference's."""
         if self.scene.groundtruth is None:
             return {}, None
         results = trajectory_results(self.trajectory(), read_tum(self.scene.groundtruth))
@@ -308,7 +308,7 @@ class EbarfPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """What ns-eval writes under "results"; numbers alone for the logs of a training."""
+        """The results that ns-eval writes under "results"; during training, only numbers, for the logs."""
         with one_line_errors():
             results = self.evaluate(output_path)
         if step is not None:

@@ -1,7 +1,7 @@
-"""The step that ended a training, kept in a file and done again with every number looked at.
+"""Replay of the step that ended a training, with every number checked.
 
-A file holds tensors and plain values alone, all that the step depends on: the model as it was, the batch, and what the
-model knows of its scene.
+A replay file holds only tensors and plain values, all that the step depends on: the model's state, the batch, and what
+the model knows about its scene.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OUR_LINE = re.compile(r'File ".*?(ebarf_ns/\S+\.py)", line (\d+), in (\w+)')
 
 @dataclass
 class Replayed:
-    """What was found; names are those of parameters, modules and losses, in the order in which they are computed."""
+    """Findings; names are those of parameters, modules and losses, in the order in which they are computed."""
 
     step: int
     rays: int
@@ -45,12 +45,12 @@ class Replayed:
     """Modules whose output is not finite."""
     gradients_not_finite: list[str] = field(default_factory=list)
     gradients_beyond_usual: dict[str, float] = field(default_factory=dict)
-    """By how many times the norms of those exceed their usual ones that do so more than tenfold."""
+    """Ratio of each gradient's norm to its usual norm, if it exceeds 10."""
     anomaly: str = ""
-    """What torch's anomaly detection says, and where the operation stands that it means."""
+    """The message of torch's anomaly detection, and the source line of the operation."""
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """The findings as human-readable lines."""
         losses = ", ".join(f"{name} {value:.6g}" for name, value in self.losses.items())
         beyond = [f"{name} ({ratio:.3g} times)" for name, ratio in self.gradients_beyond_usual.items()]
         found = {
@@ -65,7 +65,7 @@ class Replayed:
 
 
 def write_replay(path: Path, pipeline: EbarfPipeline, usual_gradients: Tensor | None, step: int) -> None:
-    """Keep all that a training step depends on; raises :class:`TrainingError` where the disk does not take it."""
+    """Write all that a training step depends on; raises :class:`TrainingError` if writing fails."""
     model = pipeline.model
     rays, batch = pipeline.datamanager.next_train(step)
     scene, keyframes = (model.kwargs["metadata"][name] for name in ("scene", "keyframes"))
@@ -89,9 +89,9 @@ def write_replay(path: Path, pipeline: EbarfPipeline, usual_gradients: Tensor | 
 
 
 def replay(path: Path) -> Replayed:
-    """Do the step of a file again under anomaly detection, on the processor; raises :class:`TrainingError`.
+    """Repeat the step of a replay file under anomaly detection, on the CPU; raises :class:`TrainingError`.
 
-    It is as it was but for the remembered density, which is brought up to date once more.
+    The only difference is the remembered density, which is updated once more.
     """
     content = read_plain(path, "replay-*.pt")
     if content.get("format", 0) > FORMAT:
@@ -131,7 +131,7 @@ def _do_again(model: EbarfModel, rays: RayBundle, content: dict[str, Any]) -> Re
             told = f" (of {where[0]}, line {where[1]}, in {where[2]})" if where else ""
             anomaly = f"{str(error).splitlines()[0]}{told}"
     if anomaly:
-        # It ends where it finds something: the gradients are those of a second pass.
+        # Anomaly detection stops at the first finding, so a second pass computes the gradients.
         model.zero_grad()
         outputs = model(RayBundle(**content["rays"], metadata=dict(content["rays_metadata"])))
         torch.stack(list(model.get_loss_dict(outputs, content["batch"]).values())).sum().backward()

@@ -1,8 +1,8 @@
 """The configuration of a run, read from its ``config.yml`` without running what the file says.
 
-Nerfstudio dumps configurations as YAML that names classes and has its loader call them, so that a stranger's file can
-run anything. Here only the classes and functions that this package's own configurations hold can be named, and none of
-them is called but enumerations and paths. Opening the run then calls each configuration's own target.
+Nerfstudio dumps configurations as YAML that names classes, and its loader calls them, so an untrusted file can run
+arbitrary code. Here, a file can only name classes and functions that this package's own configurations contain, and
+only enumerations and paths are called. Opening the run then calls each configuration's own target.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# What may be imported to look a name up.
+# Packages that may be imported to look up a name.
 _PACKAGES = ("ebarf_ns.", "nerfstudio.", "torch.optim.", "pathlib.")
 _TAG = "tag:yaml.org,2002:python/"
 
@@ -31,7 +31,7 @@ _TAG = "tag:yaml.org,2002:python/"
 def read_run_config(path: Path) -> EbarfTrainerConfig:
     """Read the configuration of an ebarf run; raises :class:`EvaluationError`."""
     try:
-        # A safe loader with fewer, not more powers than the tags suggest.
+        # A restricted subclass of SafeLoader, despite the Python tags.
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except OSError as error:
         raise EvaluationError(f"{path}: {error.strerror or error}; expected the folder of a training run") from None
@@ -44,7 +44,7 @@ def read_run_config(path: Path) -> EbarfTrainerConfig:
 
 
 class _Loader(yaml.SafeLoader):
-    """Knows plain values, tuples, paths, and what :func:`_known` names."""
+    """Loads plain values, tuples, paths, and what :func:`_known` lists."""
 
 
 def _object(loader: _Loader, name: str, node: yaml.Node) -> Iterator[Any]:
@@ -54,7 +54,7 @@ def _object(loader: _Loader, name: str, node: yaml.Node) -> Iterator[Any]:
     made = object.__new__(kind)
     yield made
     values = loader.construct_mapping(node, deep=True)
-    # Nerfstudio calls what a configuration has as its target.
+    # Nerfstudio calls the target of a configuration.
     if values.get("_target") not in _configurations()[kind]:
         raise _refused(f"{name} has a target of another configuration", node)
     vars(made).update(values)
@@ -90,7 +90,7 @@ def _refused(why: str, node: yaml.Node) -> yaml.constructor.ConstructorError:
 
 @cache
 def _known() -> tuple[Any, ...]:
-    """The classes and functions in this package's configurations, and the paths."""
+    """The classes and functions in this package's configurations, and path classes."""
     named = [PosixPath, WindowsPath]
     for value in _values([method.config for method in (ebarf, ebarf_paper, enerf)]):
         named.append(value if callable(value) else type(value))
@@ -99,7 +99,7 @@ def _known() -> tuple[Any, ...]:
 
 @cache
 def _configurations() -> dict[type, list[Any]]:
-    """The classes of this package's configurations, and the targets that those of each class have."""
+    """The classes of this package's configurations, each with the targets that occur with it."""
     targets: dict[type, list[Any]] = {}
     for value in _values([method.config for method in (ebarf, ebarf_paper, enerf)]):
         if is_dataclass(value) and not isinstance(value, type):
@@ -108,7 +108,7 @@ def _configurations() -> dict[type, list[Any]]:
 
 
 def _values(value: object) -> Iterator[Any]:
-    """All values in a nested configuration that a file names by a class or a function."""
+    """All values in a nested configuration that are stored under the name of a class or a function."""
     if isinstance(value, type | Enum) or callable(value):
         yield value
     elif is_dataclass(value):

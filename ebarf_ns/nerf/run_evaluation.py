@@ -1,4 +1,4 @@
-"""What an evaluation leaves in a run's folder."""
+"""The files that an evaluation writes to a run's folder."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def write_refined(pipeline: EbarfPipeline, folder: Path) -> None:
-    """Write the refined trajectory, and the camera where its intrinsics are learned."""
+    """Write the refined trajectory, and the camera if its intrinsics are learned."""
     pipeline.write_refined(folder / "trajectory_refined.txt")
     if pipeline.model.intrinsics:
         write_camera(folder / "camera_refined.json", pipeline.model.intrinsics.refined())
 
 
 def record_evaluation(record: dict[str, Any], found: Support | None, folder: Path) -> None:
-    """Add a record to the run's metrics and logs, with what held-out events say of the trajectory where asked."""
+    """Add a record to the run's metrics and logs, with the trajectory's support by held-out events, if given."""
     if found:
         record["support"] = {
             "verdict": found.verdict,

@@ -1,4 +1,4 @@
-"""A run's folder has one writer at a time, and a run in it is not begun anew unless told to."""
+"""The run folder: one writer at a time, and an existing run is overwritten only on request."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from ebarf_ns.errors import TrainingError
 from ebarf_ns.nerf.checkpoints import checkpoints_in
 
 _LOCK = ".lock"
-# Temporary names, and that of a checkpoint on its way into its folder.
+# Temporary files, and a checkpoint that has not yet been moved into its folder.
 _LEFT_OVER = re.compile(r"\..+\.\w{8}(\.\w+)?|step-\d+\.ckpt")
 
 
 def take_folder(folder: Path, goes_on: bool, overwrite: bool) -> FileLock:
-    """Lock a run's folder for as long as the lock is held, and remove what a killed writer left half written.
+    """Lock a run's folder until the lock is released, and remove partly written files of a killed process.
 
-    A training that ``goes_on`` from a checkpoint in the folder keeps it; one that begins there anew must be told to
-    ``overwrite`` it. Raises :class:`TrainingError`, before anything is changed.
+    A training that ``goes_on`` resumes from a checkpoint in the folder and keeps the run. A new training in the folder
+    of a run requires ``overwrite``. Raises :class:`TrainingError` before anything is changed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / _LOCK)
@@ -43,6 +43,6 @@ def take_folder(folder: Path, goes_on: bool, overwrite: bool) -> FileLock:
 
 
 def remove_checkpoints(folder: Path) -> None:
-    """Remove the checkpoints of a run that is begun anew."""
+    """Remove the checkpoints of a run that is overwritten."""
     for path in checkpoints_in(folder / "nerfstudio_models"):
         path.unlink()

@@ -1,4 +1,4 @@
-"""What a run begins with: a plan for its scene, a folder of its own, and a record of what it is."""
+"""The start of a run: its scene, plan and configuration, and the header of its metrics."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def read_scene_of(config: TrainerConfig) -> Scene:
-    """The scene that a configuration names, with a trajectory; raises the package's errors."""
+    """The scene that a configuration names; estimates a missing trajectory if enabled. Raises the package's errors."""
     datamanager: Any = config.pipeline.datamanager
     folder = Path(datamanager.data or datamanager.dataparser.data)
     if datamanager.dataparser.kept and not folder.is_dir():
@@ -48,7 +48,7 @@ def read_scene_of(config: TrainerConfig) -> Scene:
 
 
 def check_scene_is_the_same(scene: Scene, header: dict[str, Any], checkpoint: Path) -> None:
-    """Raise :class:`TrainingError` where a scene is not the one that the run with this header was trained on."""
+    """Raise :class:`TrainingError` if the scene has changed since the run with this header was trained."""
     if changed := changed_parts(scene, header):
         raise TrainingError(
             f"{scene.folder}: {', '.join(changed)} changed since {checkpoint} was made; expected the scene that it was "
@@ -57,10 +57,9 @@ def check_scene_is_the_same(scene: Scene, header: dict[str, Any], checkpoint: Pa
 
 
 def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str, Any]) -> list[Line]:
-    """Fill in what a configuration leaves to the plan.
+    """Fill in the settings that a configuration leaves to the plan.
 
-    ``header`` is that of the run that is gone on with, whose plan stands, whatever would be planned on this machine
-    today.
+    ``header`` is that of the resumed run, if any; its plan is kept, even if this machine would plan differently.
     """
     datamanager: Any = config.pipeline.datamanager
     model: Any = config.pipeline.model
@@ -71,7 +70,7 @@ def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str,
     refractory_us = scene.refractory_us if datamanager.refractory_us is None else datamanager.refractory_us
     facts = identify_recording(file, (int(trajectory.t_us[0]), int(trajectory.t_us[-1])), refractory_us)
     if model.camera_optimizer.mode == "off" and model.camera_optimizer.longest_gap_us is None:
-        # A trajectory that stays as it came needs no keyframes to be learned.
+        # A fixed trajectory needs no inserted keyframes.
         model.camera_optimizer.longest_gap_us = 0
     start = model.camera_optimizer.start(trajectory)
     normalized = model.loss == "normalized"
@@ -85,15 +84,15 @@ def plan_run(config: TrainerConfig, scene: Scene, device: str, header: dict[str,
 
 
 def opening_config(config: TrainerConfig, folder: Path) -> str:
-    """What ``config.yml`` has to say for scripts that open the run; building the pipeline changes the configuration."""
-    # Scripts take the newest checkpoint, whatever the run was begun from.
+    """The content of ``config.yml`` for scripts that open the run; building the pipeline changes the configuration."""
+    # Scripts open the newest checkpoint, not the one that the run started from.
     opened: Any = deepcopy(replace(config, load_dir=None, load_step=None, load_checkpoint=None))
     opened.pipeline.datamanager.dataparser.kept = folder / "scene"
     return yaml.dump(opened)
 
 
 def keep_run(opening: str, config: TrainerConfig, scene: Scene, folder: Path) -> None:
-    """Write what opens the run again: its configuration, and what it needs of its scene."""
+    """Write the files needed to open the run again: its configuration and its copy of the scene."""
     kept = folder / "scene"
     keep_scene(scene, kept)
     datamanager: Any = config.pipeline.datamanager
@@ -105,7 +104,7 @@ def keep_run(opening: str, config: TrainerConfig, scene: Scene, folder: Path) ->
 def run_header(
     config: TrainerConfig, pipeline: EbarfPipeline, device: str, plan: list[Line], alignment: Alignment | None
 ) -> dict[str, Any]:
-    """The first line of ``metrics.jsonl``."""
+    """The header of ``metrics.jsonl``."""
     flags = flags_of(config)
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),

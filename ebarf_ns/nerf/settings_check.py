@@ -1,4 +1,4 @@
-"""Numbers of a run's configuration that make no sense, said in one line before anything is done."""
+"""Checks of a run's settings, with one-line errors, before anything is done."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _FREE = re.compile(
 
 
 def check_settings(config: TrainerConfig) -> None:
-    """Raise :class:`TrainingError` that names the flag, its value and what was expected."""
+    """Raise :class:`TrainingError` for an invalid setting; it names the flag, its value and what was expected."""
     warn_of_old_flags(sys.argv)
     _check_scene_is_named(config)
     for flag in _ABOVE_0:
@@ -76,7 +76,7 @@ def check_settings(config: TrainerConfig) -> None:
         if value is not None and not value >= least:
             raise TrainingError(f"--{flag.replace('_', '-')} is {value}, expected at least {least}")
     try:
-        # Nerfstudio prints the folder of the run as rich markup.
+        # Nerfstudio prints the run's folder as rich markup.
         Text.from_markup(str(config.get_base_dir()))
     except MarkupError:
         raise TrainingError(
@@ -98,7 +98,7 @@ def _check_scene_is_named(config: TrainerConfig) -> None:
 
 
 def check_machine(machine: MachineConfig) -> None:
-    """Raise :class:`TrainingError` for devices that are not here."""
+    """Raise :class:`TrainingError` for devices that this machine lacks."""
     found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
     here = [device for device, there in found.items() if there]
     if machine.device_type not in here:
@@ -113,9 +113,9 @@ def check_machine(machine: MachineConfig) -> None:
 
 
 def changed_flags(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """The flags of a run that are others now, with what they were; empty where none is, or where it did not say.
+    """The flags that changed since a run, with their old and new values; empty if none did, or none were recorded.
 
-    Those of the budget, and of what is written and shown, may change as a run goes on.
+    Flags for the budget, the output and the display may change in a resumed run and are left out.
     """
     changed = [name for name in now if name in before and before[name] != now[name] and not _FREE.match(name)]
     return ", ".join(f"--{name.replace('_', '-')} {before[name]} (now {now[name]})" for name in changed)

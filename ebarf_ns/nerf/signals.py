@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, and a terminal that is closed."""
+"""Signal handlers for Ctrl-C, SIGTERM and a closed terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from ebarf_ns.nerf.terminal import say
 
-# Windows knows no SIGHUP.
+# Windows has no SIGHUP.
 _ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -20,7 +20,7 @@ _ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if 
 def signals_to(handle: Callable[[int], None]) -> Iterator[None]:
     """Call ``handle`` with the number of the first SIGINT, SIGTERM or SIGHUP; a second one ends the process at once.
 
-    SIGHUP stays ignored where it is, as nohup has it.
+    SIGTERM and SIGHUP stay ignored if they already are, as nohup does with SIGHUP.
     """
 
     def first(number: int, _: Any) -> None:
@@ -29,7 +29,7 @@ def signals_to(handle: Callable[[int], None]) -> Iterator[None]:
         handle(number)
 
     before: dict[int, Any] = {}
-    # Python hands signals to the main thread alone.
+    # Python only allows the main thread to set signal handlers.
     if threading.current_thread() is threading.main_thread():
         ignored = [one for one in _ENDING if one != signal.SIGINT and signal.getsignal(one) == signal.SIG_IGN]
         before = {one: signal.signal(one, first) for one in _ENDING if one not in ignored}
@@ -42,7 +42,7 @@ def signals_to(handle: Callable[[int], None]) -> Iterator[None]:
 
 @contextmanager
 def output_may_end() -> Iterator[None]:
-    """Go on in silence where nobody takes the output any more: a closed terminal, a pipe whose reader has ended."""
+    """Continue silently if output can no longer be written: a closed terminal, or a pipe whose reader has ended."""
     with ExitStack() as streams:
         streams.enter_context(redirect_stdout(_Unfailing(sys.stdout)))  # pyright: ignore[reportArgumentType]
         streams.enter_context(redirect_stderr(_Unfailing(sys.stderr)))  # pyright: ignore[reportArgumentType]
@@ -50,7 +50,7 @@ def output_may_end() -> Iterator[None]:
 
 
 class _Unfailing:
-    """A stream of text that loses what cannot be written."""
+    """A text stream that discards output that cannot be written."""
 
     def __init__(self, stream: Any):
         self._stream = stream
@@ -72,12 +72,12 @@ class _Unfailing:
         try:
             yield
         except OSError:
-            # What the stream still holds would fail again when it is closed.
+            # The stream's remaining buffer would fail again when it is closed.
             with suppress(OSError), open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self._stream.fileno())
 
 
 def end(number: int) -> None:
-    """Leave with the exit code that shells know a signal by: 130, 143 or 129."""
+    """Exit with the shell's exit code for a signal: 130, 143 or 129."""
     say(f"{signal.Signals(number).name}: ends")
     raise SystemExit(128 + number)

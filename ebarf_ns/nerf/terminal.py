@@ -1,4 +1,4 @@
-"""What a training says in the terminal: its scene and plan, one live line, a line per evaluation, a summary."""
+"""Terminal output of a training: its scene and plan, one live line, a line per evaluation, a summary."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Results = Mapping[str, Any]
 
 
 def say(text: str) -> None:
-    """Print text as it is: a path may hold what rich takes for markup."""
+    """Print text literally, since a path may contain rich markup."""
     CONSOLE.print(text, markup=False, soft_wrap=not CONSOLE.is_terminal)
 
 
 def scene_line(scene: Scene, events: int, keyframes: int) -> str:
-    """What is trained on."""
+    """A line that describes the scene."""
     given = scene.contrast_threshold
     parts = [
         f"{events:,} events",
@@ -35,7 +35,7 @@ def scene_line(scene: Scene, events: int, keyframes: int) -> str:
 
 
 def plan_line(plan: Sequence[Line]) -> str:
-    """How it is trained, in short; ``ebarf inspect`` has the reasons."""
+    """A line that summarises the plan; ``ebarf inspect`` gives the reasons."""
     made = {line.field.rsplit(".", 1)[-1]: line.value for line in plan}
     parts = [
         f"grid of {made['grid_levels']} levels to {made['grid_finest']} cells",
@@ -48,7 +48,7 @@ def plan_line(plan: Sequence[Line]) -> str:
 
 
 def errors_line(results: Results, given: Results) -> str:
-    """Errors in units that people use, those of the given trajectory before the refined one's.
+    """Errors in common units, those of the given trajectory before those of the refined one.
 
     ``given`` are the errors of the initial trajectory, see
     :func:`~ebarf_ns.evaluation.trajectory_error.trajectory_results`; empty without a reference.
@@ -58,7 +58,7 @@ def errors_line(results: Results, given: Results) -> str:
         parts.append(f"unexplained events {results['heldout_event_loss']:.1%}")
     if results.get("psnr") is not None:
         parts.append(f"PSNR {results['psnr']:.1f} dB")
-    # Along a straight line, or without any shift, positions are aligned otherwise, or not at all.
+    # On a straight line or without translation, positions are aligned differently or not at all.
     position = next((name for name in ("ate_m", "ate_m_orientation") if results.get(name) is not None), None)
     if position:
         parts.append(f"position {_was(given, position, 100, '.3g')}{100 * results[position]:.3g} cm")
@@ -72,12 +72,12 @@ def _was(given: Results, name: str, factor: float, form: str) -> str:
 
 
 def evaluation_line(seconds: float, step: int, results: Results, given: Results) -> str:
-    """One evaluation, for which one line is kept."""
+    """The line of one evaluation."""
     return f"{seconds:6.0f} s  step {step:,}  {errors_line(results, given)}"
 
 
 def summary(folder: Path, train_seconds: float, wall_seconds: float, results: Results, given: Results) -> str:
-    """The end of a run: how good, at what cost, what lies where, and what to do next."""
+    """The summary of a run: its errors, its cost, its files, and what to do next."""
     config = folder / "config.yml"
     return "\n".join(
         [
@@ -92,7 +92,7 @@ def summary(folder: Path, train_seconds: float, wall_seconds: float, results: Re
 
 
 class LiveLine:
-    """One line that is rewritten in place: share of the budget, step, rate, time left; nothing where no one looks."""
+    """A progress line, updated in place: share of the budget, step, rate, time left; only shown on a terminal."""
 
     def __init__(self) -> None:
         columns = (BarColumn(24), TextColumn("{task.percentage:3.0f} %  {task.fields[said]}"))
@@ -108,11 +108,11 @@ class LiveLine:
         self.stop()
 
     def stop(self) -> None:
-        """Take it away."""
+        """Remove the line."""
         self._progress.stop()
 
     def update(self, share: float, step: int, seconds: float, seconds_a_step: float, loss: float) -> None:
-        """Say how far the budget is used, after ``seconds`` of training."""
+        """Show the used share of the budget after ``seconds`` of training."""
         left = seconds * (1 - share) / share if share > 0 else 0.0
         said = f"step {step:,}  {1e3 * seconds_a_step:.0f} ms a step  {_clock(left)} left  loss {loss:.3g}"
         self._progress.update(self._task, completed=min(share, 1.0), said=said)

@@ -1,4 +1,4 @@
-"""Training within a budget of steps or seconds, with every evaluation on record and nothing half written."""
+"""Training within a budget of steps or seconds; evaluations are recorded, and files written atomically."""
 
 import math
 from functools import cached_property
@@ -45,7 +45,7 @@ from ebarf_ns.nerf.trainer_config import EbarfTrainerConfig
 from ebarf_ns.nerf.trainer_state import restore, trainer_state
 from ebarf_ns.nerf.warm_up import compile_kernels
 
-# Where config.yml of earlier versions looks for them.
+# The config.yml files of earlier versions expect these names here.
 FusedAdamConfig, KeyframeAdamConfig = optimizers.FusedAdamConfig, optimizers.KeyframeAdamConfig
 BudgetDecayConfig, BudgetDecayScheduler = optimizers.BudgetDecayConfig, optimizers.BudgetDecayScheduler
 
@@ -53,14 +53,14 @@ _ALIGNMENT_SHARE, _ALIGNMENT_SECONDS = 0.35, 30.0
 
 
 class EbarfTrainer(Trainer):
-    """Follows the budget, evaluates along the way, and leaves trajectories and metrics in the run's folder."""
+    """Trains within the budget, evaluates along the way, and writes trajectories and metrics to the run's folder."""
 
     config: EbarfTrainerConfig
     pipeline: EbarfPipeline
     optimizers: GuardedOptimizers
 
     def setup(self, test_mode: Any = "val") -> None:
-        """Build pipeline and optimizers; what a user can cause ends in one line."""
+        """Build pipeline and optimizers; user errors are reported in one line."""
         self.begun_s = monotonic()
         self.live = LiveLine()
         self.results: dict[str, Any] = {}
@@ -98,7 +98,7 @@ class EbarfTrainer(Trainer):
         self.lock = take_folder(self.base_dir, self._goes_on, self.config.overwrite)
 
     def _plan(self) -> None:
-        """Fill in what the configuration leaves to the plan, and keep it with the run."""
+        """Fill in the planned settings, and prepare the content of config.yml."""
         scene, header = read_scene_of(self.config), self._header_of_resumed_run
         if self._loaded_path and not self.config.allow_changed_scene:
             check_scene_is_the_same(scene, header, self._loaded_path)
@@ -108,7 +108,7 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def _keep(self) -> None:
-        """Nothing stands in the way of the training any more: what the folder held of another run goes."""
+        """Prepare the folder once the training is sure to start: an overwritten run's checkpoints are removed."""
         if not self._goes_on:
             remove_checkpoints(self.base_dir)
         keep_run(self.opening, self.config, self.pipeline.scene, self.base_dir)
@@ -122,7 +122,7 @@ class EbarfTrainer(Trainer):
 
     @property
     def _goes_on(self) -> bool:
-        """Whether a run goes on in its own folder."""
+        """Whether a run is resumed in its own folder."""
         loaded = self._loaded_path
         return loaded is not None and loaded.parent.resolve() == (self.base_dir / "nerfstudio_models").resolve()
 
@@ -131,7 +131,7 @@ class EbarfTrainer(Trainer):
         return read_header(self._loaded_path.parent.parent) if self._loaded_path else {}
 
     def _align(self) -> None:
-        """Look for large errors of the trajectory, where a run begins and its budget allows for it."""
+        """Correct large errors of the trajectory at the start of a new run, if its budget allows it."""
         if self._loaded_path or not self._has_budget_for_coarse_fields():
             return
         model, seconds = self.pipeline.model, self.config.max_train_seconds
@@ -147,7 +147,7 @@ class EbarfTrainer(Trainer):
         say(str(self.alignment or NOT_ALIGNED))
 
     def _has_budget_for_coarse_fields(self) -> bool:
-        """Too few steps find nothing, and say so of any trajectory."""
+        """Whether there are enough steps: with too few, every trajectory seems good."""
         settings, seconds = self.pipeline.model.config.camera_optimizer, self.config.max_train_seconds
         enough = 0 < settings.align_steps <= _ALIGNMENT_SHARE * self.config.max_num_iterations
         return enough and settings.mode == "refine" and not (seconds and seconds < _ALIGNMENT_SECONDS)
@@ -160,13 +160,13 @@ class EbarfTrainer(Trainer):
         return GuardedOptimizers(self.config.optimizers.copy(), groups)
 
     def progress(self) -> float:
-        """Used fraction of the budget, by steps or seconds, whichever is further."""
+        """Used fraction of the budget, by steps or seconds, whichever is larger."""
         by_steps = self.steps_done / self.config.max_num_iterations
         seconds = self.config.max_train_seconds
         return max(by_steps, self.train_seconds / seconds if seconds else 0.0)
 
     def train(self) -> None:
-        """Train to the end of the budget, or to a signal: nothing is lost, and the exit code is 128 and its number."""
+        """Train until the budget is used or a signal arrives; all is then saved, and the exit code is 128 + number."""
         try:
             with one_line_errors(), output_may_end(), signals_to(self._stop):
                 self._begin_metrics()
@@ -179,7 +179,7 @@ class EbarfTrainer(Trainer):
 
     def _stop(self, number: int) -> None:
         if self.training_state == "completed":
-            # All is saved, and the viewer is what still runs.
+            # Everything is saved, and only the viewer is still running.
             end(number)
         say("ends after this step; a second signal ends it at once")
         self.signal, self.stop_training = number, True
@@ -208,14 +208,14 @@ class EbarfTrainer(Trainer):
         say(summary(self.base_dir, self.train_seconds, wall_seconds, self.results, self.errors_given))
 
     def _check_viewer_warnings(self) -> None:
-        """Nerfstudio's says that nothing is evaluated, which is not so here."""
+        """Do nothing: nerfstudio's warning that nothing is evaluated does not apply."""
 
     def _train_complete_viewer(self) -> None:
         with self.averaging.shown():
             super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> Any:
-        """One step, its share of the budget, and the evaluation that may be due after it."""
+        """Run one step, update the budget, and evaluate if due."""
         started = monotonic()
         before = self.progress()
         for scheduler in self.optimizers.schedulers.values():
@@ -234,7 +234,7 @@ class EbarfTrainer(Trainer):
         after = self.progress()
         self.last_loss = float(result[0].detach())
         if after >= 1:
-            # Evaluation may fail, or take long: what was learned is safe before.
+            # Save first, since evaluation may fail or take long.
             self.save_checkpoint(step)
         if int(after * self.config.evaluations) > int(before * self.config.evaluations) or after >= 1:
             try:
@@ -250,7 +250,7 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def _left_for_others(self, step: int) -> str:
-        """What a step that ends the training leaves: the last good state, and a file that does the step again."""
+        """Write the last good state and a replay file after a failed step; returns the rest of the error message."""
         replay = self.base_dir / f"replay-{step:09d}.pt"
         try:
             write_replay(replay, self.pipeline, self.optimizers.usual, step)
@@ -258,11 +258,11 @@ class EbarfTrainer(Trainer):
         except TrainingError as error:
             return f"; {error}"
         saved = checkpoints_in(self.checkpoint_dir)
-        again = f"; --load-checkpoint {saved[-1]} goes on from before" if saved else ""
+        again = f"; --load-checkpoint {saved[-1]} resumes before it" if saved else ""
         return f"; ebarf replay {replay} looks for where they begin{again}"
 
     def _agreed(self, seconds: float) -> float:
-        """The first process's clock: all processes must take schedules and end at the same step."""
+        """The first process's clock, so that all processes have the same schedules and end at the same step."""
         if self.world_size == 1:
             return seconds
         clock = torch.tensor([seconds], dtype=torch.float64, device=self.device)
@@ -295,7 +295,7 @@ class EbarfTrainer(Trainer):
             say(str(found))
 
     def _support(self) -> Support | None:
-        """What held-out events say of the refined trajectory, where there is the budget to ask them."""
+        """How well held-out events support the refined trajectory; None if the budget is too small."""
         if not self._has_budget_for_coarse_fields():
             return None
         model, steps = self.pipeline.model, self.pipeline.model.config.camera_optimizer.align_steps // 2
@@ -312,7 +312,7 @@ class EbarfTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Write the checkpoint whole, then remove all others but the one before; the step is the last one done."""
+        """Write a checkpoint after the last completed step, unless it is saved already or not finite."""
         last = max(self.steps_done - 1, 0)
         path = self.checkpoint_dir / f"step-{last:09d}.ckpt"
         if self.saved_step == self.steps_done and path.is_file():
@@ -332,11 +332,11 @@ class EbarfTrainer(Trainer):
         changed = changed_flags(self._header_of_resumed_run.get("flags", {}), flags_of(self.config))
         restore(self, state, path, changed)
         self._start_step = self.steps_done = state["step"] + 1
-        say(f"goes on from {path}{changed and f', which was made by {changed}'}")
+        say(f"resumes from {path}{changed and f', which was made with {changed}'}")
 
     @cached_property
     def _loaded_path(self) -> Path | None:
         path, damaged = chosen_checkpoint(self.config)
         for error in damaged:
-            say(f"{error}; goes on from an older one")
+            say(f"{error}; resumes from an older one")
         return path

@@ -20,38 +20,38 @@ class EbarfTrainerConfig(TrainerConfig):
     """A nerfstudio training run with a budget."""
 
     max_train_seconds: float | None = None
-    """End after this many seconds of training, evaluation and loading excluded, if not after --max-num-iterations
-    steps before; all schedules follow."""
+    """End after this many seconds of training, without evaluation and loading, or after --max-num-iterations steps,
+    whichever comes first; all schedules follow."""
     evaluations: int = 8
-    """How often a run is evaluated into metrics.jsonl, evenly over its budget."""
+    """Number of evaluations, evenly spaced over the budget and written to metrics.jsonl."""
     overwrite: bool = False
-    """Begin anew in a folder that holds a run."""
+    """Start a new run in a folder that holds one."""
     allow_changed_scene: bool = False
-    """Go on from a checkpoint although its scene's events, trajectory or scene.json are others now."""
+    """Resume from a checkpoint even if its scene's events, trajectory or scene.json have changed."""
     estimate_trajectory: bool = True
-    """Where the scene's trajectory is still to come, estimate it from the events first, and keep it with the scene."""
+    """If the scene has no trajectory yet, first estimate it from the events and store it in the scene."""
     learn_intrinsics: bool = False
-    """Learn focal length, principal point and the camera's distortion coefficients too; the result is written to
-    camera_refined.json, as scene.json has it."""
+    """Also learn focal length, principal point and the camera's distortion coefficients; the result is written to
+    camera_refined.json, in the format of scene.json."""
     averaged_steps: int = 100
-    """About as many last steps' parameters are averaged for evaluations and checkpoints; 1: the last step's alone."""
+    """Parameters of about this many last steps are averaged for evaluations and checkpoints; 1: no averaging."""
 
     threads: int | None = None
-    """Of torch and numba; None: one for each core that nothing else keeps busy, or as OMP_NUM_THREADS says."""
+    """Threads of torch and numba; None: one per core that is free of other work, or as set by OMP_NUM_THREADS."""
 
     def save_config(self) -> None:
-        """Look whether this machine has what is asked of it, which ns-train begins with.
+        """Check the settings instead of saving them: ns-train calls this first.
 
-        The trainer writes config.yml, when it has the folder for itself and a plan.
+        The trainer writes config.yml once it has locked the folder and made a plan.
         """
         with one_line_errors():
             check_settings(self)
             check_machine(self.machine)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Whoever reaches a viewer can drive it: it listens on loopback, unless a flag says otherwise.
+        """Make the viewer listen on loopback, unless a flag says otherwise: anyone who can reach it can control it.
 
-        ns-viewer puts its own settings here, which by default listen on all addresses.
+        ns-viewer sets its own viewer settings here, which listen on all addresses by default.
         """
         said = any(word.replace("_", "-").startswith(_HOST_FLAG) for word in sys.argv)
         if name == "viewer" and value.websocket_host == _EVERYWHERE and not said:
@@ -59,16 +59,16 @@ class EbarfTrainerConfig(TrainerConfig):
         super().__setattr__(name, value)
 
     def print_to_terminal(self) -> None:
-        """Config.yml has all of it; what matters is said as the plan."""
+        """Print nothing: config.yml has all settings, and the plan line shows the important ones."""
 
     def get_checkpoint_dir(self) -> Path:
-        """Where checkpoints lie; scripts that open a run are led to the newest whole one."""
+        """The folder of the checkpoints; for scripts that open a run, also selects the newest valid checkpoint."""
         folder = super().get_checkpoint_dir()
         opened = self.pipeline.datamanager.dataparser.kept is not None  # pyright: ignore[reportAttributeAccessIssue]
         if opened and self.load_dir is None and self.load_step is None and checkpoints_in(folder):
             with one_line_errors():
                 path, damaged = newest_whole(folder)
             for error in damaged:
-                say(f"{error}; {path.name} is taken")
+                say(f"{error}; {path.name} is used instead")
             self.load_step = int(path.stem.removeprefix("step-"))
         return folder

@@ -1,4 +1,4 @@
-"""What a training needs to go on bitwise where it was: taken from a trainer, and given to a new one."""
+"""The state of a training, saved and restored so that a resumed training continues bitwise identically."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ def trainer_state(trainer: Any, step: int) -> dict[str, Any]:
             "train_seconds": trainer.train_seconds,
             "event_pairs": trainer.event_pairs,
             **optimizers.guard_state(),
-            # Those of the pipeline are the mean: what everybody but a resumed training is after.
+            # The pipeline's state has the averaged parameters; only a resumed training needs the unaveraged ones.
             "trained": [parameter.detach().clone() for parameter in trainer.averaging.parameters],
         },
     }
 
 
 def restore(trainer: Any, state: dict[str, Any], path: Path, changed: str) -> None:
-    """Give a trainer the state that was read from ``path``, which was made by the flags ``changed`` since.
+    """Restore a trainer from the state read from ``path``; ``changed`` lists the flags that have changed since.
 
-    Raises :class:`TrainingError` where it does not fit.
+    Raises :class:`TrainingError` if the state does not fit.
     """
     ours = state.get("ebarf", {})
     try:
         trainer.pipeline.load_pipeline(state["pipeline"], state["step"])
-        # The moments of an earlier version may be those of other parameters.
+        # Optimizer moments of an earlier version may belong to other parameters.
         fits = not trainer.pipeline.upgraded
         trainer.averaging.begin_from(ours.get("trained") if fits else None)
         trainer.optimizers.load_optimizers(state["optimizers"] if fits else {})

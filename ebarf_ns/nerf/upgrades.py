@@ -1,4 +1,4 @@
-"""Checkpoints of earlier versions: what they lack starts as in a new training, what is no longer kept is dropped."""
+"""Checkpoints of earlier versions: missing entries start as in a new training, obsolete ones are dropped."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _MAY_LACK = {f"_model.{part}.{name}" for part, names in _ADDED.items() for name 
 def completed(
     state: Mapping[str, Tensor], fresh: Mapping[str, Tensor], what: str
 ) -> tuple[dict[str, Tensor], list[str]]:
-    """A pipeline's state with the names of a new one, and the names that were added to it.
+    """A pipeline's state completed with new entries from ``fresh``, and the names of those entries.
 
-    Raises :class:`TrainingError`, which says ``what`` was read, where the difference is none between versions.
+    Raises :class:`TrainingError`, which names ``what`` was read, if the difference is not one between versions.
     """
     state = {_undistributed(name): value for name, value in state.items() if name not in _DROPPED}
     fresh = {_undistributed(name): value for name, value in fresh.items() if name not in _DROPPED}
@@ -37,5 +37,5 @@ def completed(
 
 
 def _undistributed(name: str) -> str:
-    """The name without the prefix that torch gives the parameters of a model that several processes train."""
+    """The name without the prefix that torch adds in distributed training."""
     return name.replace("_model.module.", "_model.", 1)

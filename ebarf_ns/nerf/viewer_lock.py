@@ -1,4 +1,4 @@
-"""viser 0.2.7's lock around grouped messages, mended: a viewer, and a training with one, can stop for ever without."""
+"""A fixed lock for grouped messages in viser 0.2.7, whose own can deadlock the viewer and a training with one."""
 
 import threading
 from collections.abc import Iterator
@@ -11,8 +11,8 @@ from viser.infra._infra import WebsockMessageHandler
 def atomic(self: WebsockMessageHandler) -> Iterator[None]:
     """Group the messages sent in this block; nested calls of a thread are ignored.
 
-    Unlike viser's own, it releases the lock when the block raises (as nerfstudio's does for a client that has left),
-    and clears the owner before the lock is released, not after: by then, the lock may be another thread's.
+    Unlike viser's own, it releases the lock if the block raises (as nerfstudio's does for a client that has left), and
+    clears the owner before releasing the lock, not after, when another thread may hold it.
     """
     if self._locked_thread_id == threading.get_ident():
         yield

@@ -212,7 +212,7 @@ def test_who_opens_a_run_past_a_damaged_checkpoint_says_so(run: Path, capsys: py
     newest.write_bytes(newest.read_bytes()[:-100])
     open_run(run)
     said = capsys.readouterr().err
-    assert f"{newest}: is damaged" in said and f"{older.name} is taken" in said
+    assert f"{newest}: is damaged" in said and f"{older.name} is used instead" in said
 
 
 def test_output_that_nobody_takes_any_more_ends_nothing():

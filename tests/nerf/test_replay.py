@@ -33,7 +33,7 @@ def test_a_training_that_ends_by_a_broken_parameter_leaves_a_good_checkpoint_and
     said = capsys.readouterr().err.splitlines()[-1]
     path = ready.base_dir / "replay-000000005.pt"
     assert stopped.value.code == 2 and said.startswith("error: parameters are no longer finite")
-    assert f"ebarf replay {path}" in said and "step-000000002.ckpt goes on from before" in said
+    assert f"ebarf replay {path}" in said and "step-000000002.ckpt resumes before it" in said
     finished = run_command("ebarf", "replay", path)
     assert finished.code == 0 and "parameters not finite: renderer.field.grid.table" in finished.output
     found = json.loads(run_command("ebarf", "replay", path, "--json").output)

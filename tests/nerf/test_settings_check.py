@@ -35,6 +35,4 @@ def test_old_flags_work_and_say_what_they_are_called_now(
         monkeypatch.setattr(sys, "argv", ["ns-train", *words])
         made.pipeline.datamanager.data = tiny_scene
         check_settings(made)
-        assert (
-            capsys.readouterr().err == f"warning: {old} is now called {new}; the old name goes with the next version\n"
-        )
+        assert capsys.readouterr().err == f"warning: {old} is now called {new}; the next version removes the old name\n"
