@@ -20,7 +20,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     The target of a symbolic link is replaced, not the link. Raises :class:`EbarfError` if ``path`` is a pipe or a
     device.
     """
-    target = path.resolve()
+    # Unlike Path.resolve, it accepts a link that leads to itself, which is then replaced.
+    target = Path(os.path.realpath(path))
     if is_special(target):
         raise EbarfError(f"{path}: a pipe or a device, expected a file to write")
     temporary = None
@@ -58,7 +59,7 @@ def synced(folder: Path) -> None:
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder to fill; it becomes ``path`` (replacing it) when the block ends without an exception."""
-    path = path.resolve()
+    path = Path(os.path.realpath(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:

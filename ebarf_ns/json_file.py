@@ -27,7 +27,7 @@ def read_json(path: Path) -> Any:
     if is_special(path):
         raise SceneError(f"{path}: a pipe or a device, expected a file")
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
@@ -35,6 +35,14 @@ def read_json(path: Path) -> Any:
     except (ValueError, RecursionError) as error:
         # Python also refuses integers with thousands of digits.
         raise SceneError(f"{path}: not valid JSON ({str(error).split(';')[0]})") from None
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"key {next(key for key in keys if keys.count(key) > 1)} appears twice")
+    return content
 
 
 class JsonObject:

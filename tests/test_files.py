@@ -24,6 +24,12 @@ def test_a_link_stays_and_what_it_leads_to_is_written(tmp_path: Path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file.txt", "link.txt", "there"]
 
 
+def test_a_link_to_itself_is_replaced(tmp_path: Path):
+    (tmp_path / "loop").symlink_to("loop")
+    write(tmp_path / "loop")
+    assert (tmp_path / "loop").read_text() == "new" and not (tmp_path / "loop").is_symlink()
+
+
 def test_pipes_and_devices_are_not_replaced(tmp_path: Path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)

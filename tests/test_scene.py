@@ -129,6 +129,13 @@ def test_broken_json_is_named(tmp_path: Path, content: bytes):
         read_scene(tmp_path)
 
 
+def test_a_key_that_appears_twice_is_named(tmp_path: Path):
+    path = make(tmp_path) / "scene.json"
+    path.write_text(path.read_text().replace("{", '{"events": "other.h5", ', 1))
+    with pytest.raises(SceneError, match=r"scene.json: not valid JSON \(key events appears twice\)"):
+        read_scene(tmp_path)
+
+
 @pytest.mark.parametrize("name", ["scene.json", "events.h5", "trajectory.txt"])
 def test_a_pipe_is_never_waited_for(tmp_path: Path, name: str):
     (make(tmp_path) / name).unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import signal
 import sys
 import warnings
 from importlib.metadata import entry_points
@@ -47,7 +48,11 @@ def train(words: list[str]) -> None:
     # Warnings of torch and nerfstudio about their own code.
     warnings.filterwarnings("ignore", category=FutureWarning)
     sys.argv = command
-    raise SystemExit(found.load()())
+    try:
+        raise SystemExit(found.load()())
+    except KeyboardInterrupt:
+        # Before the first step, and during imports, there is nothing to save.
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def _check(folder: Path) -> None:

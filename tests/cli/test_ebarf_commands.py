@@ -172,6 +172,25 @@ def test_a_command_that_is_told_to_end_leaves_nothing_half_written(tmp_path: Pat
     assert running.returncode == code and "Traceback" not in said and not list(tmp_path.iterdir())
 
 
+INTERRUPTED_IMPORT = """
+import sys
+from importlib.metadata import EntryPoint
+from ebarf_ns.cli import entry
+
+def interrupt(_):
+    raise KeyboardInterrupt
+
+EntryPoint.load = interrupt
+entry.entrypoint()
+"""
+
+
+def test_a_training_interrupted_during_imports_ends_without_a_traceback(tiny_scene: Path):
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT, "train", tiny_scene]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert finished.returncode == 130 and "Traceback" not in finished.stderr
+
+
 def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):
     shutil.rmtree(trained_run / "report")
     numbers = json.loads(run_ok("ebarf", "evaluate", trained_run, "--json"))
