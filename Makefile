@@ -1,4 +1,4 @@
-# make demo: from nothing to a trained scene. make test: from nothing to green tests.
+# From a fresh checkout, make demo trains a scene, and make test runs the tests.
 VENV ?= .venv
 DEMO ?= demo
 DEMO_SECONDS ?= 120
@@ -19,7 +19,7 @@ check: setup
 	ruff format --check .
 	pyright --pythonpath $(abspath $(BIN)/python)
 
-# Two at a time; tests of one file stay together, as they share scenes and runs. A test that hangs fails.
+# Two workers; tests of one file stay together because they share scenes and runs. A hanging test fails.
 test: check
 	pytest -m "not slow and not gpu" -n 2 --dist loadscope --durations=10 --timeout=600
 

@@ -1,4 +1,4 @@
-"""The README's picture from a run's folder: render beside frame, and the trajectory over time.
+"""The README's figure of a run: render beside frame, and the trajectory over time.
 
 python tools/figure.py RUN SCENE/groundtruth.txt FRAME OUTPUT.png
 """

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs the test suite with the oldest versions that pyproject.toml allows (constraints-oldest.txt), then with the newest
-# there are, each in an environment of its own below .venvs/ (about 8 GB each). The set in between, constraints.txt, is
-# that of make test. Names of sets and of tests may be given:
+# available, each in its own environment under .venvs/ (about 8 GB each). make test uses constraints.txt, which lies in
+# between. Optional arguments select the set and the tests:
 #   sh tools/oldest_and_newest.sh [oldest|newest|both] [TEST ...]
 set -eu
 cd "$(dirname "$0")/.."

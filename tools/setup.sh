@@ -1,7 +1,7 @@
 #!/bin/sh
-# Creates the virtual environment given as first argument with everything in it, of the versions in the file given as
-# second one (constraints.txt where not given; /dev/null for the newest there are), and the system packages that
-# nerfstudio's renderer (ffmpeg) and exporter (libusb, for open3d) need.
+# Creates the virtual environment $1 with this package and all dependencies, at the versions in the constraints file $2
+# (default: constraints.txt; /dev/null: the newest), and installs the system packages that nerfstudio's renderer
+# (ffmpeg) and exporter (libusb, for open3d) need.
 set -eu
 venv=$1
 constraints=${2:-constraints.txt}

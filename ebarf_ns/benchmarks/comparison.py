@@ -116,8 +116,7 @@ def _measured() -> dict[str, str]:
 
 
 def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
-    """The scene folder for a training, simulated or given, with the requested trajectory; and what defines it, for
-    hashing."""
+    """The folder of the simulated or given scene with the requested trajectory, and what defines it, for hashing."""
     source = manifest.scenes[job.scene]
     if isinstance(source, Simulation):
         simulation = replace(source, seed=job.seed)
@@ -148,7 +147,7 @@ def _scene(manifest: Manifest, job: Job, folder: Path) -> tuple[Path, object]:
 
 
 def _copied(scene: Scene, folder: Path) -> Scene:
-    """The scene in another folder; its events, which alone are large, stay where they are."""
+    """The scene copied to another folder; its events, the only large file, stay in place."""
 
     def copied(path: Path | None) -> Path | None:
         if path is None:

@@ -1,6 +1,6 @@
 """Speed of the engine against baselines in the same run, and how its cost scales with the workload.
 
-Our own measurements need only torch, numpy, numba and h5py, so that ``python -m ebarf_ns.benchmarks.engine`` also runs
+The engine's measurements need only torch, numpy, numba and h5py, so ``python -m ebarf_ns.benchmarks.engine`` also runs
 on a bare GPU machine (without scipy, poses are interpolated linearly and each keyframe moves alone). Baselines are
 measured if nerfstudio is importable, and skipped otherwise.
 """
@@ -129,7 +129,7 @@ class _Engine:
             yield Figure(f"sampler's speed over the step's, {pairs:,} pairs", seconds / drawn, "times", at_least=5)
 
     def roofline(self) -> Iterator[Figure]:
-        """The field beside the limits of this machine's arithmetic and memory."""
+        """The field against the machine's compute and memory limits."""
         quick = self.quick
         yield from roofline(
             64 if quick else 1024, 128 if quick else 2048, 1 << (16 if quick else 26), self._repetitions
@@ -188,7 +188,7 @@ class _Engine:
             yield Figure(name, perf_counter() - started, "s", at_most=20)
 
     def index(self) -> Iterator[Figure]:
-        """Indexing many events from a file, in memory and in a temporary file."""
+        """Indexing a large event file, in memory and in a temporary file."""
         events = 100_000 if self.quick else 100_000_000
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "events.h5"
@@ -204,7 +204,7 @@ class _Engine:
                 yield Figure(f"{name}: a batch of 512 pairs", made["batch_ms"], "ms")
 
     def nerfacto(self) -> Iterator[Figure]:
-        """Training rays per second of our default method and of stock nerfacto in torch."""
+        """Training rays per second of the default method and of stock nerfacto in torch."""
         if not find_spec("nerfstudio"):
             yield Figure("training rays per second against nerfacto", None, "times")
             return
@@ -222,7 +222,7 @@ class _Engine:
             yield Figure(f"ebarf against {name}", ours / theirs, "times", at_least=target)
 
     def training(self) -> Iterator[Figure]:
-        """Trainings on the demo scene: time until within 1 dB of the final PSNR, and peak memory."""
+        """Training on the demo scene: time until within 1 dB of the final PSNR, and peak memory."""
         if not find_spec("nerfstudio"):
             yield Figure("time until within 1 dB of the final PSNR", None, "s")
             return
@@ -264,8 +264,7 @@ def _write_events(path: Path, events: int) -> None:
 
 
 def _in_own_process(*words: str) -> Any:
-    """Run this module with arguments in a subprocess and parse its last line: peak memory and nerfstudio's writers are
-    global to a process."""
+    """Run this module in a subprocess and parse its last line: peak memory and nerfstudio's writers are per process."""
     command = [sys.executable, "-m", "ebarf_ns.benchmarks.engine", *words]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 

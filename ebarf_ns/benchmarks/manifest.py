@@ -58,7 +58,7 @@ class Other:
     seed: int
     seconds: float
     refined: Path
-    """Refined trajectory, a TUM file up to a similarity of the world."""
+    """Refined trajectory, a TUM file, up to a similarity transform."""
     renders: Path | None = None
     """Folder with renders of the scene's frames, under the same file names."""
 

@@ -32,7 +32,7 @@ _PIECE = 1 << 20
 def run_recordings_benchmark(
     settings: RecordingsBenchmark, say: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Write a file in each format, convert it to a scene, and time that and the simplest way of reading the file."""
+    """Time the conversion of a file in each format to a scene, and the simplest ways of reading that file."""
     figures = []
     with tempfile.TemporaryDirectory() as folder:
         for figure in _figures(settings, Path(folder)):

@@ -1,8 +1,8 @@
-"""The field beside what the machine's arithmetic and memory allow (Williams, Waterman and Patterson 2009).
+"""Roofline model of the field on the current machine (Williams, Waterman and Patterson 2009).
 
 The limits are measured in the same run: a large matrix product, a copy in memory, and a copy of the size of the hash
-table, which mostly stays in cache. A part takes at least as long as its operations at the rate of the product, and as
-its bytes at the rate of a copy.
+table, which mostly stays in cache. The least time of a part is that of its operations at the product's rate or of its
+bytes at a copy's rate, whichever is longer.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def roofline(rays: int, side: int, large: int, repetitions: int) -> Iterator[Fig
     Passes are forward and backward, with gradients of the parameters and the points.
     """
     field = renderer(_SAMPLES, _LEVELS).field
-    # Where the processor lacks bfloat16, it is emulated, a hundred times slower.
+    # Processors without bfloat16 emulate it, a hundred times slower.
     product = {
         name: _operations_per_s(side, getattr(torch, name), repetitions)
         for name in dict.fromkeys(("float32", field.precision))

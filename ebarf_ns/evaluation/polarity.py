@@ -16,10 +16,10 @@ _DARKEST = 0.01
 
 
 def polarity_correlations(scene: Scene) -> list[float]:
-    """Return the correlations of the change between two frames with the events between them, over active pixels.
+    """Return correlations of frame-to-frame brightness changes with event polarity sums, over active pixels.
 
     Uses up to 12 pairs of consecutive frames of the event camera itself, at most 0.2 s apart. Pairs with fewer than 100
-    active pixels, or without any change, are left out.
+    active pixels, or without any change, are skipped.
     """
     camera = scene.camera
     frames = [

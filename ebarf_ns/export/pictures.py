@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _MOST_PICTURES = 1_000_000
 FRAME_NAME = "frame_{:010d}"
-"""The file naming of event-to-video tools."""
+"""File naming of event-to-video tools."""
 
 
 def render(

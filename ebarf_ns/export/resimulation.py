@@ -1,4 +1,4 @@
-"""Predicted events: a simulation of the sensor in the trained scene, along the refined trajectory."""
+"""Predicted events: the sensor simulated in the trained scene, along the refined trajectory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NEAREST_PERCENT = 5
 
 @dataclass(frozen=True)
 class _TrainedScene:
-    """The trained scene, as a scene that the simulation casts rays into."""
+    """The trained scene as surroundings for the simulator."""
 
     subject: Subject
 

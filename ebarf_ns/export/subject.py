@@ -30,7 +30,7 @@ class Subject(Protocol):
 
     scene: Scene
     camera: Camera
-    """The camera, with learned intrinsics if any were."""
+    """The camera, with learned intrinsics if any."""
     trajectory: Trajectory
     """The refined keyframes, on the clock of the events."""
     sensor: SensorModel

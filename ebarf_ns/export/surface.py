@@ -1,4 +1,4 @@
-"""Surfaces of a run, from the views of its keyframes: a mesh and a point cloud."""
+"""Mesh and point cloud of a run, from views at its keyframes."""
 
 from __future__ import annotations
 

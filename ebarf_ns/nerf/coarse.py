@@ -29,9 +29,9 @@ _FEWEST_PAIRS = 20
 
 
 def coarse_model(model: EbarfModel, mode: Literal["refine", "off"] = "refine") -> EbarfModel:
-    """A model of the same scene with coarse levels only, in which all keyframes move, or none.
+    """Build a model of the same scene with coarse levels only; all keyframes are refined, or none.
 
-    It starts with the clock and the intrinsics of ``model``.
+    Clock and intrinsics are initialised from ``model``.
     """
     config: EbarfModelConfig = deepcopy(model.config)
     assert config.grid_finest and config.grid_levels and config.density_cells
@@ -143,7 +143,7 @@ def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
 
 
 def _shares(grid: HashGrid, of_finest: float) -> Float[Tensor, "levels"]:
-    """Level weights: 1 up to the given share of the finest resolution, 0 beyond the next; the first is always 1."""
+    """Level weights: 1 up to a share of the finest resolution, 0 one level further; the coarsest is always 1."""
     resolution = torch.tensor(grid.shape.resolutions).float()
     level = (resolution / resolution[0]).log() / (resolution[1] / resolution[0]).log()
     last = (of_finest * resolution[-1] / resolution[0]).log() / (resolution[1] / resolution[0]).log()

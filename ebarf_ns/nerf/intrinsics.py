@@ -1,4 +1,4 @@
-"""Learned intrinsics: focal length, principal point, and the camera's distortion coefficients."""
+"""Learned intrinsics: focal length, principal point, and two radial distortion coefficients."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _NEWTON_STEPS = 2
 
 
 class Intrinsics(nn.Module):
-    """A learned correction of a camera's intrinsics, initially zero, in pixels at a corner of the image.
+    """A learned correction to a camera's intrinsics, initially zero, in pixels at an image corner.
 
-    The ratio of the focal lengths is fixed. The first two radial distortion coefficients are learned if the camera's
+    The ratio of the focal lengths is fixed. The first two radial distortion coefficients are learned if the camera
     model has any.
     """
 
@@ -54,9 +54,9 @@ class Intrinsics(nn.Module):
         self.correction = nn.Parameter(torch.zeros(1, len(self.unit)))
 
     def bearings(self, number: Int64[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
-        """Unit viewing directions in the camera frame of pixels given by row-major index.
+        """Unit ray directions in the camera frame, for pixels given by row-major index.
 
-        Newton's method, starting from the directions with the given intrinsics and using their Jacobians.
+        Newton's method, with starting points and fixed Jacobians from the given intrinsics.
         """
         camera, change = self.camera, (self.unit * self.correction)[0]
         centre = change.new_tensor([camera.cx, camera.cy]) + change[1:3]

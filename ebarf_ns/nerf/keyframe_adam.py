@@ -24,9 +24,9 @@ _FEW = 4
 class KeyframeAdam(torch.optim.Optimizer):
     """Adam with a matrix-valued second moment for each parameter row and for each stretch of rows.
 
-    A small rotation looks much like a shift: events constrain their sum well and their difference poorly. Adam scales
-    each parameter separately, so that the noise of the sum also limits the difference. Here the mean gradient of a row
-    is multiplied by C^(-1/2), with C the exponential moving average of its gradients' outer products (full-matrix
+    A small rotation resembles a translation: events constrain their sum well and their difference poorly. Adam scales
+    each parameter separately, so the noise of the sum also limits the difference. Here, the mean gradient of a row is
+    multiplied by C^(-1/2), where C is the exponential moving average of its gradients' outer products (full-matrix
     AdaGrad, Duchi et al. 2011, with Adam's decay): each direction is scaled by its own noise.
 
     Drift bends whole stretches of a trajectory, which shows in the sum of the keyframe gradients but not in a single
@@ -34,9 +34,9 @@ class KeyframeAdam(torch.optim.Optimizer):
     preconditioner of Bramble, Pasciak & Xu 1990): P C_P^(-1/2) P^T times the mean gradient, where each row of P^T is
     the hat function of one stretch. Without ``stretches``, and for rows of one parameter, this is Adam.
 
-    ``eps`` is added to each eigenvalue as a share of the matrix' mean diagonal. Inverse roots are recomputed for at
+    ``eps`` is added to each eigenvalue as a share of the matrix's mean diagonal. Inverse roots are recomputed for at
     most 256 rows and stretches per step, in turn; rows do not move before their first one. Without ``coupled``, each
-    parameter is scaled separately. With ``power`` below 1/2, C^(-power), poorly constrained directions move less.
+    parameter is scaled separately. A ``power`` below 1/2, C^(-power), moves poorly constrained directions less.
     """
 
     def __init__(
@@ -90,9 +90,9 @@ def _stretches(
     """Sparse matrices from rows to stretches around every row, every second, fourth, ... row, down to a few, and back.
 
     A stretch is a hat function: a row between two stretches contributes half to each; a row after the last contributes
-    fully to it. The transpose is stored too, since a product with a transposed view is many times slower.
+    fully to it. The transpose is stored too, because products with a transposed view are many times slower.
     """
-    # Imported here, since it is not needed without stretches.
+    # Imported here because only stretches need it.
     from scipy.sparse import csr_matrix, identity, vstack
 
     level, levels = identity(count, format="csr"), []

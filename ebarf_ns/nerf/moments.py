@@ -1,4 +1,4 @@
-"""Events in a time window: the recorded ones, and those that the field predicts."""
+"""Recorded and predicted events in a time window."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def brightness_at(
 def predicted_events(
     pipeline: EbarfPipeline, t_us: int, half_us: int, pixel: Int64[Tensor, "rows columns"]
 ) -> Float[Tensor, "rows columns"]:
-    """Return the sums of polarities per pixel, not rounded, that the field predicts within ``half_us`` of a time."""
+    """Return the unrounded polarity sums per pixel that the field predicts within ``half_us`` of a time."""
     before, after = (brightness_at(pipeline, t_us + shift_us, pixel) for shift_us in (-half_us, half_us))
     on, off = pipeline.model.sensor()
     change = after - before
@@ -54,7 +54,7 @@ def predicted_events(
 
 
 def write_moments(pipeline: EbarfPipeline, path: Path) -> None:
-    """Write the events of four windows of up to 20 ms, evenly spaced, for the report; nothing without a recording."""
+    """Write the events of four evenly spaced windows of up to 20 ms for the report; nothing without a recording."""
     camera = pipeline.scene.camera
     if not pipeline.scene.events.is_file():
         return

@@ -1,6 +1,6 @@
 """Verification after training: how well held-out events support the refined trajectory.
 
-A field trained jointly with the keyframes agrees with them, right or wrong. So coarse fields are trained with fixed
+A field trained jointly with the keyframes agrees with them, right or wrong. Coarse fields are thus trained with fixed
 trajectories: the refined one, the given one, and the refined one perturbed in weakly constrained directions.
 """
 
@@ -131,8 +131,8 @@ def _weakest(model: EbarfModel, depth: float, loss_refined: Losses, losses_from:
     """The less constrained of two motions that are easily confused with scene relief (the bas-relief ambiguity,
     Belhumeur, Kriegman and Yuille 1999): a pan with a sideways shift, or a tilt with a vertical shift.
 
-    With the trajectory perturbed by two pixels, held-out events are predicted worse by z standard deviations. Losses
-    are quadratic, so that one standard deviation of motion is two pixels over the square root of z.
+    Perturbing the trajectory by two pixels raises the held-out loss by z standard deviations. Losses are quadratic, so
+    one standard deviation of motion is two pixels over the square root of z.
     """
     refined = model.camera_optimizer.trajectory()
     position, quat_wxyz = refined.poses

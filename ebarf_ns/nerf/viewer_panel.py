@@ -42,7 +42,7 @@ _CPU_MAX_RES = 256
 
 @dataclass
 class _RecurringTask:
-    """Something that is updated repeatedly during training, in a small share of the time."""
+    """A task repeated during training, in a small share of its time."""
 
     do: Callable[[], None]
     due_s: float = 0.0
@@ -70,7 +70,7 @@ class ViewerPanel(ViewerControl):
         self._requested = self._shown = 0
 
     def _setup(self, viewer: Viewer) -> None:
-        """Set up the panel; nerfstudio calls this once its viewer is built, before the scene is."""
+        """Set up the panel; nerfstudio calls this after building its viewer, before the scene."""
         super()._setup(viewer)
         mend_viser()
         # The buttons that use these handles exist before the scene does.
@@ -79,7 +79,7 @@ class ViewerPanel(ViewerControl):
         self._drawn = DrawnScene(
             self._pipeline, self.viser_server, config.max_num_display_images, config.camera_frustum_scale
         )
-        # nerfstudio's own frustums use the horizontal field of view as the vertical one, and are never moved.
+        # nerfstudio's own frustums use the horizontal field of view as the vertical one, and never move.
         viewer.config = replace(config, max_num_display_images=0)
         for button in (viewer.hide_images, viewer.show_images, *([] if viewer.trainer else [viewer.pause_train])):
             button.visible = False
@@ -87,7 +87,7 @@ class ViewerPanel(ViewerControl):
         self.viser_server.gui.configure_theme(control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105))
         tasks = (self._drawn.draw_lines, self._draw_curves, self._pipeline.fit_display_range, self._show_moment_again)
         self._tasks = [_RecurringTask(do) for do in tasks]
-        # With depth, fog near the camera would hide the trajectories, and coarse renders would cut them to pieces.
+        # With depth, fog near the camera would hide the trajectories, and coarse renders would cut through them.
         viewer.control_panel._layer_depth.value = False
         if viewer.trainer and self._pipeline.device.type == "cpu":
             # A render of 512 pixels takes seconds on a CPU, and training gets nine tenths of the time.
@@ -226,7 +226,7 @@ class ViewerPanel(ViewerControl):
     # Contents of the panel.
 
     def _show_moment(self) -> None:
-        """Show the images of the slider's time; if it changes meanwhile, only its last value is shown next."""
+        """Show the images at the slider's time; of changes meanwhile, only the last is shown."""
         self._requested += 1
         while self._requested != self._shown and self._drawing.acquire(blocking=False):
             try:

@@ -1,4 +1,4 @@
-"""Images of the viewer's panel: four images of one time, and training curves."""
+"""Images in the viewer's panel: four images of one time, and training curves."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Moment:
 
 
 def half_window_us(t_us: Tensor) -> int:
-    """Return half the time window of the event images at these times."""
+    """Return half the window of event images at these keyframe times [us]."""
     between = int(t_us.diff().median()) if len(t_us) > 1 else 2 * _LONGEST_HALF_US
     return max(min(between // 2, _LONGEST_HALF_US), 1)
 

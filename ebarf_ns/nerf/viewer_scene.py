@@ -40,7 +40,7 @@ class DrawnScene:
         given = pipeline.model.camera_optimizer.given.cpu()
         count = min(len(given), _MOST_FRUSTUMS if most < 0 else min(most, _MOST_FRUSTUMS))
         self.keyframes = given[np.linspace(0, len(given) - 1, count).astype(int)]
-        """Indices of the drawn keyframes, evenly spaced among those that came with the scene."""
+        """Indices of the drawn keyframes, evenly spaced among those given with the scene."""
         self.frustums: list[viser.CameraFrustumHandle] = []
         self._positions = np.zeros((0, 3))
 

@@ -1,4 +1,4 @@
-"""Full views for display: a camera and an image each, and the starting view of spirals."""
+"""Full views for display, each a camera and an image, and the start view of spirals."""
 
 import math
 import random
@@ -22,7 +22,7 @@ _LEAST_TILT = 0.1
 
 
 class EventDataset(InputDataset):
-    """Cameras with one image each: the frame taken there, or else the events around that keyframe."""
+    """Cameras with one image each: the frame taken there, or else the events around the keyframe."""
 
     def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
@@ -84,7 +84,7 @@ class SpiralStart(RandIndicesEvalDataloader):
 
 
 def upright_start(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
-    """Return the pose from which ``get_spiral_path`` makes views as upright as this camera (nerfstudio's axes)."""
+    """Return the pose from which ``get_spiral_path`` renders views as upright as this camera (nerfstudio's axes)."""
     rotation, position = camera_to_world[:, :3].double(), camera_to_world[:, 3:]
     x, y, _ = rotation[:, 2].tolist()
     if math.hypot(x, y) < _LEAST_TILT:

@@ -50,7 +50,7 @@ class HandheldMotion:
 
 @dataclass(frozen=True)
 class OrbitMotion:
-    """A camera carried around a centre that it keeps in view, with some hand sway."""
+    """A camera orbiting a centre that it keeps in view, with some hand sway."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, -0.5)
     radius_m: float = 1.5

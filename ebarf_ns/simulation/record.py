@@ -1,4 +1,4 @@
-"""Events of a view, rendered adaptively where and when brightness changes, so that none is missed or late."""
+"""Events of a view, rendered adaptively where and when brightness changes, so that no event is missed or late."""
 
 from collections.abc import Callable
 
@@ -25,8 +25,8 @@ def record(
 
     Between two renders, nothing moves more than a third of a pixel; between two samples of a pixel, its log brightness
     changes by at most a third of a threshold, except for jumps, which are located to a microsecond. Peaks are sampled
-    too. Event times are then solved for; for pixels with limited bandwidth or a refractory period, they are
-    interpolated between those samples.
+    too. Event times are then solved for or, for pixels with limited bandwidth or a refractory period, interpolated
+    between those samples.
     """
     steps = _Steps(view, model, end_us)
     radiance, distance = view.images(np.zeros(1))
@@ -63,10 +63,10 @@ class _Steps:
         self._longest_us = 1e6 / (2 * np.pi * model.widest_hz) / _STEPS_PER_LAG if model.cutoff_hz else _LONGEST_US
         rays = view.camera.width * view.camera.height * view.rays_per_pixel
         self._at_once = int(np.clip(_RAYS_AT_ONCE // rays, 1, _MOST_AT_ONCE))
-        # Lower bound of a distance after these few steps, relative to the distance now.
+        # Lower bound of a distance after these steps, relative to the current one.
         few_rad = self._at_once * _PIXELS_PER_STEP / view.pixels_per_rad.min()
         self._nearer = max(0.5, 1 - 2 * few_rad)
-        # Hand motion is constant within a millisecond.
+        # Hand velocity is constant within a millisecond.
         self._velocity, self._turn = view.velocities(np.arange(0.0, end_us + 1000, 1000))
 
     def following(self, t_us: float, distance: Float[np.ndarray, "pixels"]) -> Float[np.ndarray, "times"]:

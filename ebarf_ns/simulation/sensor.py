@@ -1,6 +1,6 @@
 """The event sensor: log brightness in, threshold crossings out (Eq. 1), with configurable imperfections.
 
-The imperfections are those described by v2e (Hu, Liu, Delbruck 2021). Deblur e-NeRF (Low & Lee 2024) models the
+The imperfections are those of v2e (Hu, Liu, Delbruck 2021). Deblur e-NeRF (Low & Lee 2024) models the
 intensity-dependent bandwidth in more detail.
 """
 
@@ -28,7 +28,7 @@ class SensorModel:
     threshold_drift: float = 0.0
     """Growth of the thresholds from start to end, relative to their mean."""
     refractory_us: float = 0.0
-    """Time for which a pixel is blind after an event; at its end, the current brightness becomes the reference."""
+    """Refractory period after an event; at its end, the current brightness becomes the reference."""
     cutoff_hz: float = 0.0
     """Bandwidth of the pixels, a first-order low-pass filter on log brightness; 0: unlimited."""
     cutoff_reference: float = 0.0
@@ -70,7 +70,7 @@ class EventSensor:
     """
 
     def __init__(self, model: SensorModel, end_us: float, seed: int, log_brightness: Float[np.ndarray, "pixels"]):
-        """Begin at time 0 with the log brightness of all pixels."""
+        """Start at time 0 with the log brightness of all pixels."""
         self.model, self.end_us = model, end_us
         self._random = np.random.default_rng([seed, 41])
         self._leak_per_us = model.threshold_on * model.leak_hz * 1e-6
@@ -81,7 +81,7 @@ class EventSensor:
         self._noise_hz[self._random.permutation(count)[: model.hot_pixels]] += model.hot_pixel_hz
         # The last sample of each pixel: time, input and low-pass output.
         self._t_us, self._input, self._output = np.zeros(count), log_brightness.copy(), log_brightness.copy()
-        # A sensor switched on long ago: levels are spread within a threshold of the brightness, equally for all seeds.
+        # As if switched on long ago: levels are spread within a threshold of the brightness, equally for all seeds.
         phase = np.random.default_rng(0).uniform(-1, 1, count)
         self.level = log_brightness + phase * self._growth(0) * np.where(
             phase > 0, self.threshold_off, self.threshold_on

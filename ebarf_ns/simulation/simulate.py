@@ -49,7 +49,7 @@ class Simulation:
     distortion: tuple[float, ...] = ()
     """Distortion coefficients: k1 k2 p1 p2 [k3] for radtan, k1 k2 k3 k4 for equidistant."""
     rays_per_pixel: Literal[1, 4, 16] = 16
-    """Rays that a pixel averages: with fewer, sharp edges cause jumps of several events at once."""
+    """Rays averaged per pixel: with fewer, sharp edges cause jumps of several events at once."""
     sensor: SensorModel = field(default_factory=SensorModel)
     """Pixel parameters."""
     tell_thresholds: bool = True
@@ -60,7 +60,7 @@ class Simulation:
     frames: int = 12
     """Number of evenly spaced validation frames."""
     exposure_ms: float = 0.0
-    """Above 0, frames with motion blur of this exposure time are also written, to frames_blurred."""
+    """If above 0, frames with motion blur of this exposure time are also written, to frames_blurred."""
     seed: int = 0
     """Random seed of the motion, the room's pattern, the sensor and the trajectory errors."""
 

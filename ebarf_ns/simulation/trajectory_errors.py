@@ -1,4 +1,4 @@
-"""Errors of an initial trajectory, as odometry makes them."""
+"""Typical odometry errors of an initial trajectory."""
 
 import math
 from dataclasses import dataclass

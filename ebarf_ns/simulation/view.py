@@ -16,12 +16,12 @@ from ebarf_ns.simulation.motion import Motion
 
 _PROBE_US = 250.0
 _KNOTS_EVERY_US = 50.0
-# The rays of this many pixels stay in cache.
+# The rays of this many pixels fit in cache.
 _PIXELS_AT_ONCE = 16384
 
 
 def _subpixels(across: int) -> list[tuple[float, float]]:
-    """A rotated grid of rays over a pixel: no two share a column or row, so that edges arrive in as many steps."""
+    """A rotated grid of rays over a pixel; no two share a column or row, so edges cross them one by one."""
     turned = [(j * across + across - 1 - i, i * across + j) for i in range(across) for j in range(across)]
     return [((column + 0.5) / across**2 - 0.5, (row + 0.5) / across**2 - 0.5) for column, row in turned]
 
