@@ -52,7 +52,7 @@ class TrajectoryEstimate:
             say = lambda step: progress.update(task, description=step)  # noqa: E731
             estimate, output, completed = self._estimate(Path(folder), say)
         write_estimate(estimate, output, completed)
-        for sentence in (*sentences(estimate), f"written: {output}, and beside it what it is worth: odometry.json"):
+        for sentence in (*sentences(estimate, completed), f"written: {output}, and its quality: odometry.json"):
             stderr.print(sentence, soft_wrap=True)
 
     def _estimate(self, folder: Path, progress: Callable[[str], None]) -> tuple[Estimate, Path, Scene | None]:

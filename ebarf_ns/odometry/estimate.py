@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from ebarf_ns.events.recording import RecordingFile
     from ebarf_ns.geometry.cameras import Camera
+    from ebarf_ns.odometry.bundle import Bundle
 
 _SHORTEST_US, _FEWEST_KEYFRAMES, _IMAGES_PER_KEYFRAME = 50_000, 12, 4
 _PILOTS, _PILOT_S, _USUAL_PX_S = 8, 0.01, 150.0
@@ -40,9 +41,9 @@ _LEAST_MOTION_PX, _NO_PARALLAX_PX, _ROTATION_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8,
 _LEAST_TRACK_SHARE = 0.3
 """Share of the keyframes that tracks must span on average to distinguish rotation from translation."""
 _LEAST_INLIERS = 0.6
-_LEAST_GAIN, _LEAST_INVERSE_DEPTH = 1.5, 0.05
-"""Least ratio of the errors of a rotation to those of a map; and ratio to the median inverse depth below which the
-distance of a point is not determined."""
+_LEAST_GAIN, _LEAST_POINT_PARALLAX_PX = 1.5, 3.0
+"""Least ratio of the errors of a rotation to those of a map; and parallax below which the distance of a point is not
+determined."""
 _TRY_PARALLAX = "move the camera sideways by a tenth of the distance to the scene, or provide a trajectory"
 _MOVING_OBJECTS = "the scene may have moving objects or too little texture"
 
@@ -169,24 +170,34 @@ def _map_estimate(
     residual = whole.residuals_px()[np.isin(whole.tracks.image, image)]
     good = np.nonzero((whole.residuals_px() < INLIER_PX) & np.isin(whole.tracks.image, image))[0]
     track = np.unique(whole.tracks.track[good])
-    # The distance of the other points is not determined.
-    track = track[bundle.point[track, 2] > _LEAST_INVERSE_DEPTH * float(np.median(bundle.point[track, 2]))]
-    points = bundle.positions()[track]
-    distance = float(np.median(np.linalg.norm(points - np.median(bundle.centre[image], axis=0), axis=1)))
+    distance = np.linalg.norm(bundle.positions()[track] - np.median(bundle.centre[image], axis=0), axis=1)
+    near = focal_px * _baselines(bundle, whole.tracks, good)[track] > _LEAST_POINT_PARALLAX_PX * distance
+    points, unit = bundle.positions()[track[near]], float(np.median(distance[near] if near.any() else distance))
     quat_xyzw = Rotation.from_matrix(bundle.rotation[image].transpose(0, 2, 1)).as_quat()
     quality = Quality(
         kind="six degrees of freedom",
         span_share=float((t_us[image[-1]] - t_us[image[0]]) / (t_us[-1] - t_us[0])),
         keyframes=len(image),
-        tracks=len(np.unique(whole.tracks.track[good])),
+        tracks=len(track),
+        distant_share=float(1 - near.mean()),
         inlier_share=float((residual < INLIER_PX).mean()),
         reprojection_px=float(np.sqrt(np.mean(residual[residual < INLIER_PX] ** 2))),
         parallax_px=parallax_px,
         disagreement=found.apart,
         view_share=view_covered,
     )
-    trajectory = _trajectory(t_us[image], bundle.centre[image] / distance, quat_xyzw)
-    return Estimate(trajectory, points / distance, found.position_std / distance, found.rotation_std_rad, quality)
+    trajectory = _trajectory(t_us[image], bundle.centre[image] / unit, quat_xyzw)
+    return Estimate(trajectory, points / unit, found.position_std / unit, found.rotation_std_rad, quality)
+
+
+def _baselines(
+    bundle: Bundle, tracks: Tracks, good: Int64[np.ndarray, "observations"]
+) -> Float64[np.ndarray, "tracks"]:
+    """Return the extent of the cameras that observed each point, from these observations."""
+    lower, upper = np.full((len(bundle.point), 3), np.inf), np.full((len(bundle.point), 3), -np.inf)
+    np.minimum.at(lower, tracks.track[good], bundle.centre[tracks.image[good]])
+    np.maximum.at(upper, tracks.track[good], bundle.centre[tracks.image[good]])
+    return np.linalg.norm(np.maximum(upper - lower, 0), axis=1)
 
 
 def _rotation_estimate(
@@ -200,6 +211,7 @@ def _rotation_estimate(
         span_share=1.0,
         keyframes=len(t_us),
         tracks=int(good.sum()),
+        distant_share=1.0,
         inlier_share=float(good[np.searchsorted(rotation.track, tracks.track)].mean()),
         reprojection_px=float(np.sqrt(np.mean(stray_px[good] ** 2))),
         parallax_px=float(np.median(stray_px)),

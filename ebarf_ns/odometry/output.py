@@ -17,13 +17,14 @@ from ebarf_ns.odometry.estimate import Estimate, estimated
 from ebarf_ns.odometry.settings import OdometrySettings
 from ebarf_ns.scene import Scene, read_scene, write_scene
 
-_OUTSIDE, _MARGIN = 0.02, 0.15
+_OUTSIDE, _MARGIN = 0.02, 0.1
 """Share of the points that are outside the bounds at each end of an axis, and margin around the others."""
-_FEWEST_FOR_BOUNDS = 50
+_FEWEST_FOR_BOUNDS, _MOST_DISTANT = 50, 0.15
+"""Number of points below which, and share of distant tracks above which, bounds are not estimated."""
 
 
 def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
-    """Write an estimated trajectory to a scene folder without trajectory.txt, and bounds if it has none.
+    """Write an estimated trajectory, and bounds around its points, to a scene folder without trajectory.txt.
 
     Raises :class:`~ebarf_ns.errors.OdometryError` if there is no reliable one; the folder is then left unchanged.
     """
@@ -33,7 +34,7 @@ def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
     say(f"{scene.trajectory} does not exist, estimating it from the events")
     estimate = of_scene(scene, OdometrySettings())
     write_estimate(estimate, scene.trajectory, scene)
-    for sentence in sentences(estimate):
+    for sentence in sentences(estimate, scene):
         say(sentence)
 
 
@@ -51,7 +52,7 @@ def of_scene(scene: Scene, settings: OdometrySettings, progress: Callable[[str],
 def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = None) -> None:
     """Write the trajectory as TUM text, with points.ply and odometry.json beside it.
 
-    A ``completed`` scene without bounds also gets estimated bounds.
+    A ``completed`` scene gets estimated bounds; its own were in another frame and unit.
     """
     quality = estimate.quality
     comments = [
@@ -70,13 +71,16 @@ def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = Non
             temporary.write_text(_ply(estimate.points), encoding="ascii")
     with whole_file(path.with_name("odometry.json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-    if completed is not None and completed.bounds is None and (bounds := estimated_bounds(estimate)) is not None:
-        write_scene(replace(completed, bounds=bounds))
+    if completed is not None:
+        write_scene(replace(completed, bounds=estimated_bounds(estimate)))
     write_tum(path, estimate.trajectory, comments)
 
 
-def sentences(estimate: Estimate) -> list[str]:
-    """Return the verdict and the quality of an estimate as lines for the terminal."""
+def sentences(estimate: Estimate, completed: Scene | None = None) -> list[str]:
+    """Return the verdict and the quality of an estimate as lines for the terminal.
+
+    ``completed`` is the scene as it was before the estimate.
+    """
     quality, t_us = estimate.quality, estimate.trajectory.t_us
     span = f"{int(t_us[0]) * 1e-6:.3f} to {int(t_us[-1]) * 1e-6:.3f} s, {quality.span_share:.1%} of the recording"
     first = {
@@ -89,6 +93,8 @@ def sentences(estimate: Estimate) -> list[str]:
         f"{quality.tracks} tracks over {quality.view_share:.0%} of the view, {quality.inlier_share:.0%} of their "
         f"observations are inliers, reprojection error {quality.reprojection_px:.2f} px",
     ]
+    if completed is not None and completed.bounds is not None:
+        found.append("bounds replaced: those of scene.json were not in the frame and unit of the estimate")
     rotation_deg = np.degrees(estimate.rotation_std_rad)
     rotations = f"{np.median(rotation_deg):.2f} (at most {rotation_deg.max():.2f}) degrees"
     if quality.disagreement is not None:
@@ -106,8 +112,8 @@ def sentences(estimate: Estimate) -> list[str]:
 
 
 def estimated_bounds(estimate: Estimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Return the corners of a box around the cameras and nearly all points, or None if there are few points."""
-    if len(estimate.points) < _FEWEST_FOR_BOUNDS:
+    """Return the corners of a box around the cameras and nearly all points, or None if the scene may extend further."""
+    if len(estimate.points) < _FEWEST_FOR_BOUNDS or estimate.quality.distant_share > _MOST_DISTANT:
         return None
     lower, upper = np.quantile(estimate.points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
     cameras = estimate.trajectory.poses.position.numpy()

@@ -36,6 +36,8 @@ class Quality:
     keyframes: int
     tracks: int
     """Number of tracks with inliers."""
+    distant_share: float
+    """Share of these tracks whose parallax is too small for a distance."""
     inlier_share: float
     """Share of the observations with a reprojection error below 2 px."""
     reprojection_px: float
