@@ -181,8 +181,17 @@ class Evaluate:
         if self.json:
             print_json({**evaluations[-1], "method": header.get("method"), "report": str(page)})
         else:
-            Console().print_json(data=evaluations[-1])
-            _stderr.print(f"report: {page}")
+            self._print(header, evaluations[-1], page)
+
+    def _print(self, header: dict[str, Any], results: dict[str, Any], page: Path) -> None:
+        from ebarf_ns.evaluation.verdict import verdict
+
+        said = verdict(results)
+        seconds = f", {results['train_seconds']:.0f} s of training" if results.get("train_seconds") else ""
+        print(f"{said.headline} ({header.get('method')}, {results['step']:,} steps{seconds})")
+        for reason in said.reasons:
+            print(f"  {reason}")
+        print(f"report: {page}\n--json prints all results")
 
 
 @dataclass

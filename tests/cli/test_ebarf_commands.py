@@ -195,6 +195,8 @@ def test_evaluate_makes_the_report_from_the_folder(trained_run: Path):
     shutil.rmtree(trained_run / "report")
     numbers = json.loads(run_ok("ebarf", "evaluate", trained_run, "--json"))
     assert numbers["method"] == "ebarf" and numbers["step"] == 80
+    said = run_ok("ebarf", "evaluate", trained_run)
+    assert said.startswith("The field ") and "held-out events" in said and str(numbers["report"]) in said
     page = Path(numbers["report"]).read_text()
     assert "data:image/png;base64," in page and "<svg" in page and "http" not in page.split("</style>")[0]
     assert "pipeline.model.grid_levels" in page and "no contraction" in page
