@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ import numpy as np
 import pytest
 
 from ebarf_ns.geometry.trajectory_file import read_tum
+from ebarf_ns.simulation.simulate import Simulation, simulate
 from tests.conftest import TINY_TRAINING, free_port, wait_for_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -81,22 +83,28 @@ def opened(*command: object) -> Iterator[Visit]:
     )  # fmt: skip
     try:
         wait_for_page(f"http://127.0.0.1:{port}", process, PATIENCE_S)
-        with playwright.sync_playwright() as driver:
-            browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
-            visit = Visit(browser.new_page(viewport={"width": 1400, "height": 900}))
-            visit.page.set_default_timeout(1000 * PATIENCE_S)
-            visit.page.goto(f"http://127.0.0.1:{port}")
-            visit.page.get_by_text("Event camera").wait_for()
+        with visited(port, CHROMIUM) as visit:
             # A page opened while nerfstudio was still building its own has asked for its logo.
             visit.outside.clear()
             visit.page.reload()
             visit.page.get_by_text("Event camera").wait_for()
             wait_until(lambda: len(visit.pictures()) == 2)
             yield visit
-            browser.close()
     finally:
         process.kill()
         process.wait()
+
+
+@contextmanager
+def visited(port: int, browser_path: object) -> Iterator[Visit]:
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=browser_path, args=SOFTWARE_GL)
+        visit = Visit(browser.new_page(viewport={"width": 1400, "height": 900}))
+        visit.page.set_default_timeout(1000 * PATIENCE_S)
+        visit.page.goto(f"http://127.0.0.1:{port}")
+        visit.page.get_by_text("Event camera").wait_for()
+        yield visit
+        browser.close()
 
 
 def wait_until(true: Callable[[], bool]) -> None:
@@ -155,3 +163,79 @@ def test_a_running_training(tiny_scene: Path, tmp_path: Path):
         visit.picture("training_later")
         assert not visit.errors
         assert all(VISERS_REQUEST.fullmatch(url) for url in visit.outside)
+
+
+TIMED = """
+import sys, time
+from nerfstudio.scripts.train import entrypoint
+from ebarf_ns.nerf.averaging import Averaging
+
+follow = Averaging.follow
+def timed(self, steps_done):
+    follow(self, steps_done)
+    print("step", steps_done, time.monotonic(), file=sys.stderr, flush=True)
+Averaging.follow = timed
+entrypoint()
+"""
+PHASE_S, PHASES = 20, 3
+
+
+class Timed:
+    """A training of the demo scene whose steps are timed."""
+
+    def __init__(self, scene: Path, folder: Path, *flags: object):
+        words = ("ebarf", "--data", scene, "--output-dir", folder, "--max-num-iterations=100000", "--evaluations=0")
+        # Threads that wait must not take the browser's share of the processor.
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", TIMED, *map(str, words), NO_ALIGNMENT, *map(str, flags)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "OMP_WAIT_POLICY": "passive"},
+        )  # fmt: skip
+        self.times_s: list[float] = []
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr
+        for line in self.process.stderr:
+            if line.startswith("step "):
+                self.times_s.append(float(line.split()[2]))
+
+    def rate(self) -> float:
+        """Steps per second over the next seconds."""
+        start_s = time.monotonic()
+        time.sleep(PHASE_S)
+        return sum(start_s <= one < start_s + PHASE_S for one in self.times_s) / PHASE_S
+
+    def __enter__(self) -> "Timed":
+        wait_until(lambda: len(self.times_s) > 0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+def test_training_is_hardly_slower_with_a_viewer_and_shows_the_scene_within_20_s(tmp_path: Path):
+    """A share of 5 % of the steps without a client and of 25 % with one; the browser has the lowest priority."""
+    scene = simulate(Simulation(), tmp_path / "scene").folder
+    polite = tmp_path / "browser"
+    polite.write_text(f'#!/bin/sh\nexec nice -n 19 {CHROMIUM} "$@"\n')
+    polite.chmod(0o755)
+    alone, unseen, seen = [], [], []
+    for k in range(PHASES):
+        with Timed(scene, tmp_path / f"alone{k}", "--vis=tensorboard") as training:
+            training.rate()
+            alone.append(training.rate())
+        port = free_port()
+        watched = ("--vis=viewer", "--viewer.websocket-port", port)
+        with Timed(scene, tmp_path / f"watched{k}", *watched) as training, visited(port, polite) as visit:
+            wait_until(lambda: time.monotonic() > training.times_s[0] + 20)
+            assert visit.picture(f"after_20_s_{k}").std() > 20
+            seen.append(training.rate())
+        with Timed(scene, tmp_path / f"unseen{k}", "--vis=viewer", "--viewer.websocket-port", free_port()) as training:
+            training.rate()
+            unseen.append(training.rate())
+    ratios = [[one / without for one, without in zip(rates, alone, strict=True)] for rates in (unseen, seen)]
+    sys.stderr.write(f"\n  steps/s alone {alone}, with a viewer {unseen}, with a page open {seen}\n")
+    assert np.median(ratios[0]) >= 0.95 and np.median(ratios[1]) >= 0.75
