@@ -221,7 +221,7 @@ def _between_two(summary: Summary, trajectory: Trajectory) -> list[str]:
 def print_summary(summary: Summary, folder: Path) -> None:
     """Print the summary for people, warnings first."""
     console = print_facts(folder, summary.suspicions, _lines(summary))
-    console.print("\nplan of training, which these flags of ns-train overrule:")
+    console.print("\nplan of training, and the flags of ns-train that override it:")
     for line in summary.plan:
         print_line(console, f"{line.flag} = {line.value}: {line.reason}")
 
@@ -235,7 +235,9 @@ def _timing(sensor: SensorFacts) -> str:
     clock = "microseconds" if sensor.clock_step_us == 1 else f"steps of {sensor.clock_step_us:,} us"
     lamps = f"lamps flicker at {sensor.flicker_hz:.1f} Hz" if sensor.flicker_hz else "no lamp flickers"
     double = (
-        f"{sensor.doubles_share:.1%} doubled within {sensor.doubles_us} us" if sensor.doubles_us else "none doubled"
+        f"{sensor.doubles_share:.1%} doubled within {sensor.doubles_us} us"
+        if sensor.doubles_us
+        else "no doubled events"
     )
     return f"{clock}; {lamps}; {double}"
 
@@ -258,14 +260,14 @@ def _lines(summary: Summary) -> list[tuple[str, str]]:
         (
             "trajectory",
             f"{summary.keyframes} keyframes, {summary.keyframes_per_second:.1f} a second, "
-            f"{summary.trajectory_start_us:,} to {summary.trajectory_end_us:,} us, path {summary.path_length:.3f} long",
+            f"{summary.trajectory_start_us:,} to {summary.trajectory_end_us:,} us, length {summary.path_length:.3f}",
         ),
         ("events within it", f"{summary.events_within_trajectory:,} ({within:.1%})"),
         (
             "thresholds",
             f"stated: on {threshold[0]}, off {threshold[1]}"
             if threshold
-            else "not stated; " + f"by events that must cancel, on / off is {_range(summary.sensor.threshold_ratio)}",
+            else f"not stated; by ON and OFF events that cancel, on / off: {_range(summary.sensor.threshold_ratio)}",
         ),
         ("blind time", f"{_range(summary.sensor.refractory_us)} us after an event, by the shortest intervals"),
         ("clock, lamps, doubles", _timing(summary.sensor)),

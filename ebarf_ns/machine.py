@@ -30,7 +30,7 @@ def free_threads() -> Line:
     busy = max(sum(shares) / 100 - own_load, 0.0)
     busy_cores = int(busy + 1 - _BUSY_SHARE)
     count = max(min(available, len(shares) - busy_cores), 1)
-    return Line("threads", count, f"{len(shares)} cores, {busy:.1f} of them busy with other work")
+    return Line("threads", count, f"{len(shares)} cores, {busy:.1f} of them used by other programs")
 
 
 def use_threads(count: int | None) -> None:

@@ -72,7 +72,7 @@ def plan_for(
     # A view covers less than half the width of contracted space.
     supported = max(round(sqrt(events)) * (1 if bounded else 2), 32)
     if finest > supported:
-        finest, why = supported, f"one cell per event over a visible surface; pixels would resolve {finest}"
+        finest, why = supported, f"one cell per event over a visible surface; pixels resolve up to {finest}"
     planned_finest, finest = finest, finest_given or finest
     levels = 1 + max(ceil(log(finest / coarsest) / log(_GROWTH)), 0)
     rows_log2 = int(np.clip(round(2 * log(finest, 2)), 10, 19))
@@ -152,7 +152,7 @@ def _sensor_lines(scene: Scene, facts: SensorFacts, normalized: bool) -> list[Li
         value, deviation, ratio_why = stated.on / stated.off, 0.0, "thresholds given in scene.json"
     else:
         value, deviation = ratio.value, log(ratio.high / ratio.low) / 4
-        ratio_why = f"estimated from events that must cancel: {ratio.low:.2f} to {ratio.high:.2f}"
+        ratio_why = f"estimated from ON and OFF events that cancel: {ratio.low:.2f} to {ratio.high:.2f}"
     blank = 0.0 if normalized else _MOST_BLANK * facts.blank_share
     return [
         Line(

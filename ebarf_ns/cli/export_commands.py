@@ -47,7 +47,7 @@ class Render:
             refuse_existing(output)
         with _opened(self.run_folder, "rendering") as (finished, progress):
             count = render(finished, self.settings, output, progress)
-        _stderr.print(f"{count:,} pictures: {output}", soft_wrap=True)
+        _stderr.print(f"{count:,} picture{'s' * (count != 1)}: {output}", soft_wrap=True)
 
     def _events(self, path: Path) -> None:
         from ebarf_ns.export.resimulation import agreement, recorded, write_events

@@ -1,6 +1,7 @@
 """``ebarf inspect``: the contents of a scene or a recording, and what looks wrong."""
 
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ class Inspect:
             )
         if self.picture and self.picture.suffix.lower() != ".png":
             raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
+        self._refuse_dataset()
         # A folder that is neither is treated as a scene, so that the error says what it lacks.
         if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
             summary = self._recording(self.scene)
@@ -50,13 +52,28 @@ class Inspect:
         elif self.picture:
             Console().print(f"picture  {self.picture}", soft_wrap=True, highlight=False)
 
-    def _recording(self, events: Path, shown: bool = True) -> Any:
+    def _refuse_dataset(self) -> None:
+        """Raise :class:`SceneError` for the folder of a dataset, which is made into a scene first."""
+        from ebarf_ns.formats.layouts import recognised_layout
+        from ebarf_ns.formats.recognise import recognised_folder
+
+        if (self.scene / "scene.json").exists() or not self.scene.is_dir() or recognised_folder(self.scene):
+            return
+        with suppress(SceneError):
+            layout = recognised_layout(self.scene)
+            raise RecordingError(
+                f"{self.scene}: the folder of a recording ({layout}), expected a scene or the recording's file; make "
+                f"a scene: ebarf process auto {self.scene} --output SCENE"
+            )
+
+    def _recording(self, events: Path, size: tuple[int, int] | None = None, shown: bool = True) -> Any:
         from ebarf_ns.formats.raw_inspection import contact_sheet, inspect_recording, print_raw_summary
         from ebarf_ns.formats.recognise import open_recording
 
-        opened = partial(
+        known = partial(
             open_recording, events, part=self.part, time_unit=self.event_time_unit, columns=self.event_columns
         )
+        opened = known if size is None else lambda: replace(known(), sensor_size=size)
         summary = inspect_recording(opened)
         if self.picture:
             contact_sheet(opened, summary, self.picture)
@@ -70,7 +87,7 @@ class Inspect:
 
         scene = read_scene(self.scene, trajectory_to_come=True)
         if not scene.trajectory.is_file():
-            summary = self._recording(scene.events)
+            summary = self._recording(scene.events, (scene.camera.width, scene.camera.height))
             if not self.json:
                 how = f"training estimates one first, as does ebarf trajectory estimate {self.scene}"
                 Console().print(f"no trajectory yet: {how}", soft_wrap=True, highlight=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 _GOOD, _DOUBTFUL = 0.3, 0.5
+_RELATED = 0.5
 _UNEVEN_THRESHOLDS = 2.5
 Mark = Literal["good", "doubtful", "bad"]
 _HEADLINES: dict[Mark, str] = {
@@ -29,7 +30,7 @@ def verdict(results: Mapping[str, Any], moved: tuple[float, float] | None = None
     """Return the verdict on a run from its last evaluation and its pose correction (share of the extent, degrees).
 
     Held-out events decide: up to 30 % unexplained is good, more than half is bad. If they support the given trajectory
-    over the refined one, the verdict is doubtful at best.
+    over the refined one, or renders correlate weakly with frames, the verdict is doubtful at best.
     """
     reasons, mark = [], "doubtful"
     unexplained = results.get("heldout_event_loss")
@@ -46,6 +47,10 @@ def verdict(results: Mapping[str, Any], moved: tuple[float, float] | None = None
     if results.get("inverted"):
         mark = "bad"
         reasons.append("renders are inverted: bright where the frames are dark")
+    correlation = results.get("log_correlation")
+    if correlation is not None and correlation < _RELATED:
+        mark = "doubtful" if mark == "good" else mark
+        reasons.append(f"the brightness of renders hardly follows that of the frames (correlation {correlation:.2f})")
     if results.get("psnr") is not None:
         reasons.append(f"held-out frames are reproduced with a PSNR of {results['psnr']:.1f} dB")
     if moved is not None:

@@ -56,7 +56,7 @@ def span_us(subject: Subject, span: Span) -> tuple[int, int]:
     first_us, last_us = subject.trajectory.t_us[[0, -1]].tolist()
     start_us = first_us if span.start_us is None else span.start_us
     end_us = last_us if span.end_us is None else span.end_us
-    if not first_us <= start_us < end_us <= last_us:
+    if not first_us <= start_us <= end_us <= last_us:
         raise ExportError(
             f"the requested span is {start_us} to {end_us} us, expected increasing times within {first_us} to "
             f"{last_us} us, the span of the refined trajectory"

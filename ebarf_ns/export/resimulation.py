@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from ebarf_ns.errors import ExportError
 from ebarf_ns.events.recording import Recording, RecordingFile, write_recording
 from ebarf_ns.export.pictures import span_us
 from ebarf_ns.simulation.record import record
@@ -72,6 +73,8 @@ def write_events(
     Raises :class:`ExportError` for invalid spans.
     """
     start_us, end_us = span_us(subject, span)
+    if start_us == end_us:
+        raise ExportError(f"the requested span is {start_us} to {end_us} us, expected a longer one")
     view = View(_TrainedScene(subject), _RefinedMotion(subject, start_us), subject.camera, rays_per_pixel=1)
     events = record(view, subject.sensor, end_us - start_us, _SEED, progress)
     events = replace(events, t_us=events.t_us + start_us)

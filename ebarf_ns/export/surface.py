@@ -27,6 +27,7 @@ _MOST_VIEWS, _MOST_PIXELS = 40, 25_000
 _WIDEST_TAN = float(np.tan(np.radians(60)))
 _VOXELS, _MOST_VOXELS = 160, 60_000_000
 _EDGE_PERCENT, _MARGIN = 1.0, 0.02
+_TRY = "train longer, or raise --blur"
 
 
 class Points(NamedTuple):
@@ -52,7 +53,7 @@ def write_mesh(
         volume.add(view)
     mesh = volume.surface()
     if not len(mesh.face):
-        raise NoSurfaceError("no surface is sharp enough for a mesh, try a longer training")
+        raise NoSurfaceError(f"no surface is sharp enough for a mesh; {_TRY}")
     grey = _tone(subject).grey(mesh.brightness)
     with whole_file(path) as temporary:
         trimesh.Trimesh(mesh.vertex, mesh.face, vertex_colors=_rgba(grey), process=False).export(temporary)
@@ -109,7 +110,7 @@ def _views(subject: Subject, settings: SurfaceSettings, progress: Callable[[floa
         views.append(replace(view, distance=np.where(sharp, view.distance, 0)))
         progress((k + 1) / len(t_us))
     if not any(view.distance.any() for view in views):
-        raise NoSurfaceError("no surface is sharp enough, try a longer training")
+        raise NoSurfaceError(f"no surface is sharp enough; {_TRY}")
     return views
 
 

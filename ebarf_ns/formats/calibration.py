@@ -200,7 +200,7 @@ def _nine_numbers(path: Path, text: str, sensor_size: Size | None) -> Camera:
     if len(values) != 9 or not np.isfinite(values).all() or min(values[:2]) <= 0:
         raise SceneError(f"{path}: holds {' '.join(text[:400].split())[:80]!r}, expected {ECD_EXPECTED}")
     if sensor_size is None:
-        raise SceneError(f"{path}: does not say how large the sensor is, expected --sensor-size")
+        raise SceneError(f"{path}: does not say how large the sensor is, expected --sensor-size WIDTH HEIGHT")
     fx, fy, cx, cy, *distortion = values
     return Camera("radtan", *sensor_size, fx, fy, cx, cy, tuple(distortion))
 

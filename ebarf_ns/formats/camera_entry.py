@@ -257,7 +257,7 @@ def _size(entry: Entry, given: Size | None) -> Size:
     elif given is not None:
         return given
     else:
-        raise SceneError(f"{entry.path}: does not say how large the sensor is, expected --sensor-size")
+        raise SceneError(f"{entry.path}: does not say how large the sensor is, expected --sensor-size WIDTH HEIGHT")
     if not all(1 <= side <= _LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise entry.wrong(key, expected)
     return int(width), int(height)

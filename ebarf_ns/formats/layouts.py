@@ -56,6 +56,8 @@ class Ingredients:
     """Number of skipped frames, by topic and reason; counted while reading."""
     contrast_threshold: ContrastThreshold | None = None
     notes: list[str] = field(default_factory=list)
+    sensor_size: tuple[int, int] | None = None
+    """Columns and rows of the dataset's sensor, for calibrations and recordings that do not give them."""
 
 
 @dataclass(frozen=True)
@@ -78,18 +80,17 @@ NOTHING_GIVEN = Given()
 
 def ecd(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:
     """The event camera dataset (Mueggler et al. 2017): events.txt, calib.txt, groundtruth.txt, images.txt."""
-    camera = None
+    davis_size, camera = (240, 180), None
     if given.camera is None:
-        camera = read_calibration(folder / "calib.txt", sensor_size=given.sensor_size or (240, 180)).camera
+        camera = read_calibration(folder / "calib.txt", sensor_size=given.sensor_size or davis_size).camera
     groundtruth, notes = None, []
     if (folder / "groundtruth.txt").is_file():
         groundtruth, notes = read_trajectory(folder / "groundtruth.txt", TrajectoryFormat("s", "xyzw"))
     # DAVIS frames are linear up to an offset of the sensor.
     listed = _listed(folder / "images.txt", "s") if given.frames else []
     frames = tuple(FrameFile(path, t_us, None, np.eye(4), "linear") for t_us, path in listed)
-    return Ingredients(
-        lambda: read_text(folder / "events.txt", given.event_time_unit or "s"), camera, groundtruth, frames, notes=notes
-    )
+    events = lambda: read_text(folder / "events.txt", given.event_time_unit or "s")  # noqa: E731
+    return Ingredients(events, camera, groundtruth, frames, notes=notes, sensor_size=davis_size)
 
 
 def tumvie(folder: Path, given: Given = NOTHING_GIVEN) -> Ingredients:

@@ -268,7 +268,9 @@ def _assemble(
 def _camera(ingredients: Ingredients, settings: ProcessSettings, said: Size | None) -> tuple[Camera, list[str]]:
     camera, notes = ingredients.camera, list(ingredients.notes)
     if settings.camera and camera is None:
-        calibrated = read_calibration(settings.camera, settings.camera_name, settings.sensor_size or said)
+        calibrated = read_calibration(
+            settings.camera, settings.camera_name, settings.sensor_size or said or ingredients.sensor_size
+        )
         camera, notes = calibrated.camera, [*notes, *calibrated.notes]
     if camera is None:
         raise SceneError(

@@ -55,8 +55,8 @@ class WeakDirection:
 
     def __str__(self) -> str:
         more = " or more" if self.or_more else ""
-        size = f"{self.turn_deg:.2g} deg with {self.shift:.2g}{more}"
-        return f"least certain: {self.name}, {size} (one standard deviation)"
+        size = f"{self.turn_deg:.2g}° and {self.shift:.2g} of the trajectory's unit{more}"
+        return f"least certain: {self.name}, by {size} (one standard deviation)"
 
 
 @dataclass(frozen=True)

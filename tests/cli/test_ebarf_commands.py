@@ -324,3 +324,9 @@ def test_swapped_columns_of_a_real_file_are_caught(tmp_path: Path, tiny_scene: P
     shutil.copy(swapped, scene / "events.h5")
     finished = run_command("ebarf", "inspect", scene)
     assert finished.code == 2 and "events.h5" in finished.errors
+
+
+def test_inspect_of_a_dataset_says_how_to_make_a_scene(tmp_path: Path):
+    (tmp_path / "events.txt").write_text("0.1 1 1 1\n")
+    finished = run_command("ebarf", "inspect", tmp_path)
+    assert finished.code == 2 and f"ebarf process auto {tmp_path} --output SCENE" in finished.errors

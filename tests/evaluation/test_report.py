@@ -128,3 +128,9 @@ def test_a_verdict_follows_from_held_out_events(results: dict, mark: str):
     found = verdict(results)
     assert found.mark == mark
     assert all("nan" not in reason for reason in found.reasons)
+
+
+def test_renders_that_do_not_follow_the_frames_are_doubtful():
+    found = verdict({"heldout_event_loss": 0.28, "log_correlation": 0.41})
+    assert found.mark == "doubtful" and any("correlation 0.41" in one for one in found.reasons)
+    assert verdict({"heldout_event_loss": 0.28, "log_correlation": 0.9}).mark == "good"

@@ -96,3 +96,7 @@ def test_impossible_wishes_are_said_and_nothing_is_written(
 def test_times_reach_the_last_moment(known: KnownRoom):
     t_us = picture_times(known, RenderSettings(fps=30))
     assert t_us[0] == 1_000_000 and len(t_us) == 31 and t_us[-1] == 2_000_000 and abs(t_us[1] - 1_033_333) <= 1
+
+
+def test_one_moment_is_one_picture(known: KnownRoom):
+    assert picture_times(known, RenderSettings(start_us=1_500_000, end_us=1_500_000)).tolist() == [1_500_000]

@@ -52,4 +52,6 @@ def test_agreement_tells_wrong_from_right(known: KnownRoom, tmp_path: Path):
 def test_times_without_poses_are_refused(known: KnownRoom, tmp_path: Path):
     with pytest.raises(ExportError, match="the span of the refined trajectory"):
         write_events(known, Span(start_us=-1), tmp_path / "out.h5")
+    with pytest.raises(ExportError, match="1500000 to 1500000 us, expected a longer one"):
+        write_events(known, Span(start_us=1_500_000, end_us=1_500_000), tmp_path / "out.h5")
     assert not list(tmp_path.iterdir())

@@ -490,6 +490,13 @@ def ecd(folder: Path) -> Path:
     return folder
 
 
+def test_a_calibration_without_a_sensor_size_is_completed_by_the_dataset(tmp_path: Path):
+    source = ecd(tmp_path / "source")
+    process("ecd", source, tmp_path / "scene", ProcessSettings(camera=source / "calib.txt"))
+    camera = read_scene(tmp_path / "scene").camera
+    assert (camera.width, camera.height, camera.fx) == (240, 180, 60)
+
+
 def test_frames_of_another_size_are_left_out_and_counted(tmp_path: Path):
     settings = ProcessSettings(sensor_size=(64, 48))
     said = " ".join(process("ecd", ecd(tmp_path / "source"), tmp_path / "scene", settings))

@@ -19,6 +19,11 @@ def test_errors_have_units_and_what_they_were():
     )
 
 
+def test_a_reference_that_is_also_given_is_named():
+    given = {**GIVEN, "rotation_deg": 2e-6, "ate_m": 3e-10}
+    assert errors_line(RESULTS, given).endswith("(the given trajectory is the reference)")
+
+
 def test_what_is_not_known_is_left_out():
     assert errors_line({"heldout_event_loss": 0.1, "psnr": None, "ate_m": None, "rotation_deg": None}, {}) == (
         "unexplained events 10.0%"
