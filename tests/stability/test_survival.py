@@ -33,6 +33,7 @@ pytestmark = pytest.mark.slow
 SMALL = Simulation(width=24, height=18, focal_px=20.0, duration_s=0.4, frames=2, rays_per_pixel=4)
 KILLS, DAMAGES, STEPS = 50, 40, 300
 MANY_STEPS, MOST_GROWTH = 20_000, 0.02
+EARLY, LATE = range(2000, 6001, 1000), range(16_000, MANY_STEPS + 1, 1000)
 
 
 @pytest.fixture(scope="module")
@@ -357,9 +358,11 @@ def test_memory_stays_flat_over_twenty_thousand_steps(scene: Path, tmp_path: Pat
 
     ready.averaging.follow = then
     ready.train()
-    # Whatever is made by the first steps, checkpoints and evaluations is there by then.
-    growth = resident[MANY_STEPS] / resident[4000] - 1
-    say(f"{resident[4000]:.1f} MiB after 4,000 steps, {resident[MANY_STEPS]:.1f} after {MANY_STEPS} ({growth:+.2%})")
+    # The allocator gives memory back now and then, so single values vary by 2 % without any growth.
+    early, late = (float(np.median([resident[step] for step in steps])) for steps in (EARLY, LATE))
+    growth = late / early - 1
+    say(f"{early:.1f} MiB at 2,000 to 6,000 steps, {late:.1f} at 16,000 to {MANY_STEPS} ({growth:+.2%})")
+    say("every 1,000 steps: " + " ".join(f"{mib:.0f}" for mib in resident.values()))
     assert growth <= MOST_GROWTH
     assert ready.optimizers.skipped == 0
 
