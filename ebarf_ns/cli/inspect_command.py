@@ -57,7 +57,8 @@ class Inspect:
         from ebarf_ns.formats.layouts import recognised_layout
         from ebarf_ns.formats.recognise import recognised_folder
 
-        if (self.scene / "scene.json").exists() or not self.scene.is_dir() or recognised_folder(self.scene):
+        is_scene = any((self.scene / name).exists() for name in ("scene.json", "trajectory.txt"))
+        if is_scene or not self.scene.is_dir() or recognised_folder(self.scene):
             return
         with suppress(SceneError):
             layout = recognised_layout(self.scene)
