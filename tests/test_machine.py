@@ -28,7 +28,7 @@ def two_cores(monkeypatch: pytest.MonkeyPatch):
 def test_a_busy_core_is_left_to_others(monkeypatch: pytest.MonkeyPatch, shares: list[float], count: int):
     monkeypatch.setattr(psutil, "cpu_percent", lambda interval, percpu: shares)
     found = free_threads()
-    assert found.value == count and f"{sum(shares) / 100:.1f} of them busy" in found.reason
+    assert found.value == count and f"{sum(shares) / 100:.1f} of them used" in found.reason
 
 
 def test_what_the_environment_says_stands(monkeypatch: pytest.MonkeyPatch):
