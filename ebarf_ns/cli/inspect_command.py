@@ -41,11 +41,11 @@ class Inspect:
             )
         if self.picture and self.picture.suffix.lower() != ".png":
             raise RecordingError(f"--picture is {self.picture}, expected the name of a .png file to make")
-        self._refuse_dataset()
         # A folder that is neither is treated as a scene, so that the error says what it lacks.
         if not (self.scene / "scene.json").exists() and (self.scene.is_file() or recognised_folder(self.scene)):
             summary = self._recording(self.scene)
         else:
+            self._refuse_dataset()
             summary = self._scene()
         if self.json:
             print_json(asdict(summary))
@@ -55,10 +55,9 @@ class Inspect:
     def _refuse_dataset(self) -> None:
         """Raise :class:`SceneError` for the folder of a dataset, which is made into a scene first."""
         from ebarf_ns.formats.layouts import recognised_layout
-        from ebarf_ns.formats.recognise import recognised_folder
 
         is_scene = any((self.scene / name).exists() for name in ("scene.json", "trajectory.txt"))
-        if is_scene or not self.scene.is_dir() or recognised_folder(self.scene):
+        if is_scene:
             return
         with suppress(SceneError):
             layout = recognised_layout(self.scene)

@@ -13,8 +13,8 @@ from ebarf_ns.plan import Line
 from ebarf_ns.scene import Scene
 
 Results = Mapping[str, Any]
-_SAME_DEG = 1e-4
-"""Rotation error below which a trajectory is the reference itself."""
+_SAME = 1e-5
+"""Errors, in degrees and in the reference's unit, below which a trajectory is the reference itself."""
 
 
 def say(text: str) -> None:
@@ -66,7 +66,8 @@ def errors_line(results: Results, given: Results) -> str:
         parts.append(f"position {_was(given, position, 100, '.3g')}{100 * results[position]:.3g} cm")
     if results.get("rotation_deg") is not None:
         parts.append(f"rotation {_was(given, 'rotation_deg', 1, '.2f')}{results['rotation_deg']:.2f}°")
-    if given.get("rotation_deg") is not None and given["rotation_deg"] < _SAME_DEG:
+    errors = [given[name] for name in ("rotation_deg", "ate_m", "ate_m_orientation") if given.get(name) is not None]
+    if len(errors) > 1 and max(errors) < _SAME:
         parts.append("(the given trajectory is the reference)")
     return "  ".join(parts)
 

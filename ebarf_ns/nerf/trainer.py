@@ -1,6 +1,5 @@
 """Training within a budget of steps or seconds; evaluations are recorded, and files written atomically."""
 
-import gc
 import math
 from functools import cached_property
 from pathlib import Path
@@ -294,8 +293,6 @@ class EbarfTrainer(Trainer):
         say(evaluation_line(self.train_seconds, self.steps_done, self.results, self.errors_given))
         if found:
             say(str(found))
-        # Evaluations leave reference cycles, which Python would keep for thousands of steps.
-        gc.collect()
 
     def _support(self) -> Support | None:
         """How well held-out events support the refined trajectory; None if the budget is too small."""

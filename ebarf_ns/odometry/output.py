@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,10 @@ from ebarf_ns.events.recording import RecordingFile
 from ebarf_ns.events.sensor_facts import identify_recording
 from ebarf_ns.files import whole_file
 from ebarf_ns.geometry.trajectory_file import write_tum
+from ebarf_ns.json_file import read_json, write_json
 from ebarf_ns.odometry.estimate import Estimate, estimated
 from ebarf_ns.odometry.settings import OdometrySettings
-from ebarf_ns.scene import Scene, read_scene, write_scene
+from ebarf_ns.scene import Scene, read_scene
 
 _OUTSIDE, _MARGIN = 0.02, 0.1
 """Share of the points that are outside the bounds at each end of an axis, and margin around the others."""
@@ -72,7 +73,9 @@ def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = Non
     with whole_file(path.with_name("odometry.json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     if completed is not None:
-        write_scene(replace(completed, bounds=estimated_bounds(estimate)))
+        # Writing the whole scene would lose the entries of missing frames.
+        scene_json = completed.folder / "scene.json"
+        write_json(scene_json, {**read_json(scene_json), "bounds": estimated_bounds(estimate)})
     write_tum(path, estimate.trajectory, comments)
 
 

@@ -20,8 +20,9 @@ def test_errors_have_units_and_what_they_were():
 
 
 def test_a_reference_that_is_also_given_is_named():
-    given = {**GIVEN, "rotation_deg": 2e-6, "ate_m": 3e-10}
+    given = {**GIVEN, "rotation_deg": 2e-6, "ate_m": 3e-10, "ate_m_orientation": 2e-10}
     assert errors_line(RESULTS, given).endswith("(the given trajectory is the reference)")
+    assert "reference" not in errors_line(RESULTS, {**given, "ate_m": 0.05})
 
 
 def test_what_is_not_known_is_left_out():

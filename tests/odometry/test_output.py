@@ -59,3 +59,13 @@ def test_bounds_of_another_frame_do_not_stay(tiny_scene: Path, tmp_path: Path):
     write_estimate(estimate, scene.trajectory, scene)
     assert read_scene(scene.folder).bounds is None
     assert not any("bounds" in line for line in sentences(estimate, replace(scene, bounds=None)))
+
+
+def test_entries_of_missing_frames_stay(tiny_scene: Path, tmp_path: Path):
+    scene = without_trajectory(tiny_scene, tmp_path / "scene")
+    listed = (scene.folder / "frames.json").read_bytes()
+    scene.frames[0].path.unlink()
+    scene = read_scene(scene.folder, trajectory_to_come=True)
+    assert scene.missing
+    write_estimate(estimate_of(tiny_scene, np.random.default_rng(0).uniform(-1, 1, (400, 3))), scene.trajectory, scene)
+    assert (scene.folder / "frames.json").read_bytes() == listed
