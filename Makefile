@@ -30,9 +30,8 @@ demo: setup
 	rm -rf $(DEMO)/scene $(DEMO)/runs
 	ebarf simulate $(DEMO)/scene
 	ebarf inspect $(DEMO)/scene
-	ns-train ebarf --data $(DEMO)/scene --output-dir $(DEMO)/runs --experiment-name scene --timestamp run \
+	ebarf train $(DEMO)/scene --output-dir $(DEMO)/runs --experiment-name scene --timestamp run \
 		--max-train-seconds $(DEMO_SECONDS) --vis tensorboard --logging.local-writer.enable False
-	ns-eval --load-config $(RUN)/config.yml --output-path $(RUN)/evaluation.json
 	ebarf evaluate $(RUN)
 	@echo
 	@echo "report with plots     $(RUN)/report/report.html"

@@ -49,8 +49,13 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     rotations and fits position and scale, which is also defined for motion along a line. Raises
     :class:`EvaluationError` if the alignment is undefined: fewer than 3 poses, no motion, or for Umeyama's a line.
     """
+    return _error(estimate, reference, alignment, _rotation_errors_deg(estimate, reference))
+
+
+def _error(
+    estimate: Trajectory, reference: Trajectory, alignment: Alignment, rotations_deg: tuple[float, float]
+) -> TrajectoryError:
     estimated, true = _matched(estimate, reference)
-    turned, straight = _rotations(estimated), _rotations(true)
     if alignment == "orientation":
         _, _, scale = _align_by_orientation(estimated, true)
     else:
@@ -61,8 +66,8 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     )
     return TrajectoryError(
         ate_m=float(position_error.get_statistic(metrics.StatisticsType.rmse)),
-        rotation_deg=_rotation_error_deg(turned, straight, with_body=False),
-        rotation_deg_body=_rotation_error_deg(turned, straight, with_body=True),
+        rotation_deg=rotations_deg[0],
+        rotation_deg_body=rotations_deg[1],
         ape_full=float(full_error.get_statistic(metrics.StatisticsType.mean)),
         scale=float(scale),
         matched=int(estimated.num_poses),
@@ -109,7 +114,7 @@ def _align_by_orientation(estimated: PosePath3D, true: PosePath3D) -> tuple[np.n
 
 
 def _rotations(path: PosePath3D) -> Rotation:
-    return Rotation.from_matrix(np.asarray(path.poses_se3)[:, :3, :3])
+    return Rotation.from_quat(path.orientations_quat_wxyz[:, [1, 2, 3, 0]])
 
 
 def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
@@ -119,6 +124,12 @@ def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
     """
     estimated, true = _matched(estimate, reference)
     return _rotation_error_deg(_rotations(estimated), _rotations(true), with_body=False)
+
+
+def _rotation_errors_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
+    """The rotation error, without and with a constant rotation of the body fitted."""
+    turned, straight = map(_rotations, _matched(estimate, reference))
+    return _rotation_error_deg(turned, straight, False), _rotation_error_deg(turned, straight, True)
 
 
 def rotation_errors_by_positions_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
@@ -181,6 +192,16 @@ def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, P
     )
 
 
+def orientation_alignment(
+    estimate: Trajectory, reference: Trajectory
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
+    """The rotation, the shift and the scale s of the ``orientation`` alignment: x -> s R x + shift.
+
+    Raises :class:`EvaluationError` as :func:`trajectory_error` does.
+    """
+    return _align_by_orientation(*_matched(estimate, reference))
+
+
 def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.ndarray, "keyframes 3"]:
     """The estimate's positions aligned by orientation and scale, for plots; unchanged if that is undefined."""
     try:
@@ -213,9 +234,13 @@ def errors_under_each_alignment(
 ) -> tuple[dict[Alignment, TrajectoryError], dict[Alignment, str]]:
     """The errors of each defined alignment, and the reason for each undefined one."""
     errors, reasons = {}, {}
+    try:
+        rotations_deg = _rotation_errors_deg(estimate, reference)
+    except EvaluationError as problem:
+        return {}, dict.fromkeys(ALIGNMENTS, str(problem))
     for alignment in ALIGNMENTS:
         try:
-            errors[alignment] = trajectory_error(estimate, reference, alignment)
+            errors[alignment] = _error(estimate, reference, alignment, rotations_deg)
         except EvaluationError as problem:
             reasons[alignment] = str(problem)
     return errors, reasons

@@ -39,7 +39,7 @@ def test_make_demo_goes_from_nothing_to_a_report(tmp_path: Path):
     for name in ("report/report.html", "report/trajectory.svg", "renders/0000.png", "trajectory_refined.txt"):
         assert (run / name).stat().st_size > 500
         assert str(run / name.split("/", maxsplit=1)[0]) in finished.stdout
-    assert json.loads((run / "evaluation.json").read_text())["results"]["psnr"] > 10
+    assert json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["psnr"] > 10
 
 
 def test_the_first_block_is_the_two_commands_of_the_makefile():
@@ -49,6 +49,7 @@ def test_the_first_block_is_the_two_commands_of_the_makefile():
     assert all(f"\n{target}:" in makefile for target in targets)
 
 
+@pytest.mark.slow
 def test_the_real_recording_block_runs(slider_depth: Path, tmp_path: Path):
     (block,) = [block for block in blocks(DOCS["benchmarks.md"]) if any("slider_depth" in line for line in block)]
     shutil.copytree(slider_depth, tmp_path / "slider_depth")

@@ -229,7 +229,6 @@ def test_a_run_outlives_its_recording(without_recording: Path, tmp_path: Path):
     run_ok("ns-eval", *run, "--output-path", tmp_path / "eval.json")
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert results["heldout_event_loss"] is None and results["psnr"] > 5
-    run_ok("ns-export", "cameras", *run, "--output-dir", tmp_path / "cameras")
     run_ok("ns-export", "pointcloud", *run, "--output-dir", tmp_path / "cloud", "--num-points=3000")
 
 

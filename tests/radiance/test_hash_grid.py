@@ -62,7 +62,7 @@ def poison(*shape: int) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.levels}x{shape.features}")
 def test_values_and_gradients_agree_with_the_reference(backend: Backend, shape: HashGridShape):
-    for ours, theirs in zip(*both(made(shape, backend), random_points(2000)), strict=True):
+    for ours, theirs in zip(*both(made(shape, backend), random_points(300 if INTERPRETED else 2000)), strict=True):
         assert (ours - theirs).abs().max() < 1e-4 * theirs.abs().max()
 
 
