@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from ebarf_ns.odometry.estimate import Estimate, estimated
 from ebarf_ns.odometry.settings import OdometrySettings
 from ebarf_ns.scene import Scene, read_scene
 
+if TYPE_CHECKING:
+    from jaxtyping import Float64
+
+Corners = tuple[tuple[float, ...], tuple[float, ...]]
 _OUTSIDE, _MARGIN = 0.02, 0.1
 """Share of the points that are outside the bounds at each end of an axis, and margin around the others."""
 _FEWEST_FOR_BOUNDS, _MOST_DISTANT = 50, 0.15
@@ -75,7 +80,9 @@ def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = Non
     if completed is not None:
         # Writing the whole scene would lose the entries of missing frames.
         scene_json = completed.folder / "scene.json"
-        write_json(scene_json, {**read_json(scene_json), "bounds": estimated_bounds(estimate)})
+        cameras = estimate.trajectory.poses.position.numpy()
+        bounds = bounds_around(estimate.points, cameras, estimate.quality.distant_share)
+        write_json(scene_json, {**read_json(scene_json), "bounds": bounds})
     write_tum(path, estimate.trajectory, comments)
 
 
@@ -114,12 +121,13 @@ def sentences(estimate: Estimate, completed: Scene | None = None) -> list[str]:
     ]
 
 
-def estimated_bounds(estimate: Estimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+def bounds_around(
+    points: Float64[np.ndarray, "points 3"], cameras: Float64[np.ndarray, "keyframes 3"], distant_share: float
+) -> Corners | None:
     """Return the corners of a box around the cameras and nearly all points, or None if the scene may extend further."""
-    if len(estimate.points) < _FEWEST_FOR_BOUNDS or estimate.quality.distant_share > _MOST_DISTANT:
+    if len(points) < _FEWEST_FOR_BOUNDS or distant_share > _MOST_DISTANT:
         return None
-    lower, upper = np.quantile(estimate.points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
-    cameras = estimate.trajectory.poses.position.numpy()
+    lower, upper = np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
     lower, upper = np.minimum(lower, cameras.min(axis=0)), np.maximum(upper, cameras.max(axis=0))
     margin = _MARGIN * float((upper - lower).max())
     return tuple((lower - margin).tolist()), tuple((upper + margin).tolist())

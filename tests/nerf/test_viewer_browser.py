@@ -6,8 +6,8 @@ With EBARF_SCREENSHOTS, the screenshots are kept in that folder.
 
 import os
 import re
-import signal
 import shutil
+import signal
 import subprocess
 import sys
 import threading
