@@ -19,13 +19,14 @@ from ebarf_ns.geometry.trajectory import Trajectory, intervals, within_span
 from ebarf_ns.geometry.trajectory_file import read_tum
 from ebarf_ns.geometry.trajectory_jumps import torn
 from ebarf_ns.machine import free_threads
-from ebarf_ns.plan import Line, plan_for
+from ebarf_ns.plan import Line, depth_spread, plan_for
 from ebarf_ns.printing import print_facts, print_line
 from ebarf_ns.scene import Scene, check_bounds, check_clocks, events_left_out, read_scene
 
 _FEW_EVENTS_PER_PIXEL = 5
 _FEW_PIXELS = 0.005
 # Beyond these fields of view, a focal length in the wrong unit is more likely than such a lens.
+_DEEP = 3.0
 _WIDEST_DEG, _WIDEST_FISHEYE_DEG, _NARROWEST_DEG = 150, 240, 2
 
 
@@ -138,9 +139,7 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     if summary.events_within_trajectory:
         found += events_left_out(outside, summary.events)
     if not 0.35 < summary.brighter_share < 0.65:
-        found.append(
-            f"{summary.brighter_share:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?"
-        )
+        found.append(f"{summary.brighter_share:.0%} of the events are brighter: unequal thresholds, or polarity lost?")
     if summary.hot_pixels:
         found.append(f"hot pixels, 3 times busier than their neighbours, left out of training: {summary.hot_pixels:,}")
     if summary.sensor.flicker_hz:
@@ -149,11 +148,9 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
             "follow them, and are left out of training where they are less than half"
         )
     if summary.sensor.clock_step_us > 1:
-        found.append(
-            f"times come in steps of {summary.sensor.clock_step_us:,} us: what moves a pixel in less cannot be told"
-        )
+        found.append(f"times come in steps of {summary.sensor.clock_step_us:,} us: faster changes cannot be resolved")
     if summary.sensor.dead_pixels > 0.01 * summary.width * summary.height:
-        found.append(f"pixels that never respond, by those around them: {summary.sensor.dead_pixels:,}")
+        found.append(f"pixels that never respond although their neighbours do: {summary.sensor.dead_pixels:,}")
     if summary.events_per_active_pixel < _FEW_EVENTS_PER_PIXEL:
         found.append(
             f"only {summary.events_per_active_pixel:.1f} events per active pixel: too short for a detailed picture"
@@ -168,8 +165,14 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
         away = float(((position < lower) | (position > upper)).any(dim=-1).double().mean())
         if away > 0:
             found.append(f"{away:.0%} of the keyframes lie outside the bounds: they must hold all that is seen")
+    spread = depth_spread(scene, trajectory)
+    if spread is not None and spread > _DEEP:
+        found.append(
+            f"the bounds are {spread:.1f} times as far away in some directions as in others: detail nearby is lost; "
+            'without bounds ("bounds": null in scene.json), space is contracted instead'
+        )
     if summary.path_length == 0:
-        found.append("the trajectory does not move: depth cannot be seen without translation")
+        found.append("the trajectory does not move: without translation, depth cannot be estimated")
     gaps_us = trajectory.t_us.diff()
     if int(gaps_us.max()) > 5 * float(gaps_us.double().median()):
         times = int(gaps_us.max()) / float(gaps_us.double().median())
@@ -180,8 +183,8 @@ def _suspicions(scene: Scene, summary: Summary, trajectory: Trajectory) -> list[
     found.extend(torn(trajectory))
     if scene.bounds is None:
         found.append(
-            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail; where "
-            "you know how far away the farthest thing is, ebarf process has --farthest"
+            "no bounds in scene.json: all of space is contracted around the trajectory, at some cost in detail; if "
+            "the scene is a room, give the distance of its farthest wall to ebarf process as --farthest"
         )
     return found
 

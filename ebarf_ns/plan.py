@@ -219,17 +219,35 @@ def _far_side(scene: Scene, trajectory: Trajectory) -> tuple[float, float] | Non
     """Median distance to the far side of the bounds over keyframes and directions, and the bounds' largest side."""
     if scene.bounds is None:
         return None
+    _, scale, _ = box_of_bounds(scene.bounds)
+    distances = _far_sides(scene, trajectory)
+    return (max(float(distances.median()), 0.01 / scale) if len(distances) else 1 / scale), 2 / scale
+
+
+def depth_spread(scene: Scene, trajectory: Trajectory) -> float | None:
+    """How many times as far the bounds are in some directions of view as in others; None without bounds.
+
+    The quotient of the 90 % and 10 % quantiles over keyframes and directions.
+    """
+    distances = _far_sides(scene, trajectory)
+    if not len(distances):
+        return None
+    near, far = distances.quantile(torch.tensor([0.1, 0.9], dtype=distances.dtype)).tolist()
+    return far / max(near, 1e-12 * far) if far > 0 else None
+
+
+def _far_sides(scene: Scene, trajectory: Trajectory) -> Float[torch.Tensor, "rays"]:
+    """Distances to the far side of the bounds from keyframes within them, over directions of view; may be empty."""
+    if scene.bounds is None:
+        return torch.zeros(0, dtype=torch.float64)
     centre, scale, half_sides = box_of_bounds(scene.bounds)
     place = (trajectory.poses.position.double() - centre) * scale
     inside = (place.abs() < half_sides).all(dim=-1).nonzero()[:, 0]
-    if not len(inside):
-        return 1 / scale, 2 / scale
     some = inside[:: max(1, len(inside) // 50)]
     quat_wxyz = trajectory.poses.quat_wxyz[some].double()
     bearing = _some_bearings(scene).double()
     direction = rotate(quat_wxyz[:, None], bearing[None]).flatten(0, 1)
-    exits = leave_box(Rays(place[some].repeat_interleave(len(bearing), dim=0), direction), half_sides)
-    return max(float(exits.median()), 0.01) / scale, 2 / scale
+    return leave_box(Rays(place[some].repeat_interleave(len(bearing), dim=0), direction), half_sides) / scale
 
 
 def _some_bearings(scene: Scene) -> Float[torch.Tensor, "pixels 3"]:

@@ -41,6 +41,7 @@ def long_gap(scene: Path) -> None:
         (edited(camera={"fx": 0.01, "fy": 0.01}), "the camera sees 180 by 180 degrees"),
         (edited(camera={"fx": 4100, "fy": 4100}), "the camera sees 0.671 by 0.503 degrees"),
         (edited(bounds=[[-3, -3, -3], [-0.88, 3, 3]]), "64% of the keyframes lie outside the bounds"),
+        (edited(bounds=[[-40, -40, -3], [40, 40, 3]]), "times as far away in some directions as in others"),
         (long_gap, "the longest gap between keyframes is 201 ms, 201 times the median"),
     ],
 )

@@ -206,7 +206,8 @@ def _renders(run: Path) -> str:
     if not paths:
         return "<p>The scene has no frames to compare with. What held-out events say stands above.</p>"
     chosen = paths[:: -(-len(paths) // _MOST_RENDERS)]
-    figures = [] if len(chosen) == len(paths) else [f"<p>{len(chosen)} of {len(paths)} frames.</p>"]
+    count = "" if len(chosen) == len(paths) else f"{len(chosen)} of {len(paths)} frames. "
+    figures = [f"<p>{count}The table's PSNR is of linear brightness, that of a picture of its grey values.</p>"]
     for path in chosen:
         picture, psnr = with_error_map(path)
         source = f"data:image/png;base64,{base64.b64encode(picture).decode()}"

@@ -53,7 +53,7 @@ def write_mesh(
         volume.add(view)
     mesh = volume.surface()
     if not len(mesh.face):
-        raise NoSurfaceError(f"no surface is sharp enough for a mesh; {_TRY}")
+        raise NoSurfaceError(f"too few surfaces are sharp enough for a mesh; {_TRY}")
     grey = _tone(subject).grey(mesh.brightness)
     with whole_file(path) as temporary:
         trimesh.Trimesh(mesh.vertex, mesh.face, vertex_colors=_rgba(grey), process=False).export(temporary)
@@ -101,16 +101,21 @@ def _views(subject: Subject, settings: SurfaceSettings, progress: Callable[[floa
     camera = without_distortion(subject.camera)
     in_view = _in_view(subject.camera, bearings(camera))
     t_us = evenly(subject.trajectory.t_us.numpy(), _MOST_VIEWS).tolist()
-    views = []
+    views, sharpest = [], np.inf
     for k, one in enumerate(t_us):
         view = look(subject, camera, one)
         sharp = in_view & (view.spread < settings.blur * view.distance)
+        blur = view.spread[in_view] / np.maximum(view.distance[in_view], 1e-12)
+        sharpest = min(sharpest, float(np.quantile(np.nan_to_num(blur, nan=np.inf), 0.25)))
         if settings.farthest:
             sharp &= view.distance <= settings.farthest
         views.append(replace(view, distance=np.where(sharp, view.distance, 0)))
         progress((k + 1) / len(t_us))
     if not any(view.distance.any() for view in views):
-        raise NoSurfaceError(f"no surface is sharp enough; {_TRY}")
+        raise NoSurfaceError(
+            f"no surface is sharp enough: a quarter of a view is blurred by at most {sharpest:.2g} of its distance, "
+            f"expected {settings.blur:g} or less; {_TRY}"
+        )
     return views
 
 

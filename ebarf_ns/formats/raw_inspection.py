@@ -122,7 +122,7 @@ def _suspicions(source: Source, counts: np.ndarray, brighter: float, late: int) 
     if late:
         found.append(f"{late:,} events are earlier than the one before them; ebarf process has --unsorted sort")
     if not 0.35 < brighter < 0.65:
-        found.append(f"{brighter:.0%} of the events are brighter: unequal thresholds, or polarity lost on the way?")
+        found.append(f"{brighter:.0%} of the events are brighter: unequal thresholds, or polarity lost?")
     hot = int(np.count_nonzero(far_busier(counts, _HOT_DEVIATIONS)))
     if hot:
         found.append(

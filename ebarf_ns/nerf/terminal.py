@@ -87,7 +87,7 @@ def summary(folder: Path, train_seconds: float, wall_seconds: float, results: Re
     return "\n".join(
         [
             f"done    {errors_line(results, given)}",
-            f"        {train_seconds:.0f} s of training in {wall_seconds:.0f} s",
+            f"        {train_seconds:.0f} s of training in {wall_seconds:.0f} s, with evaluations",
             f"run     {folder}",
             f"report  {folder / 'report' / 'report.html'}",
             f"poses   {folder / 'trajectory_refined.txt'}",

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,14 +18,11 @@ from ebarf_ns.odometry.estimate import Estimate, estimated
 from ebarf_ns.odometry.settings import OdometrySettings
 from ebarf_ns.scene import Scene, read_scene
 
-if TYPE_CHECKING:
-    from jaxtyping import Float64
-
-Corners = tuple[tuple[float, ...], tuple[float, ...]]
 _OUTSIDE, _MARGIN = 0.02, 0.1
 """Share of the points that are outside the bounds at each end of an axis, and margin around the others."""
-_FEWEST_FOR_BOUNDS, _MOST_DISTANT = 50, 0.15
-"""Number of points below which, and share of distant tracks above which, bounds are not estimated."""
+_FEWEST_FOR_BOUNDS, _MOST_DISTANT, _DEEPEST = 50, 0.15, 8.0
+"""Number of points below which, and share of distant tracks and ratio of distances above which, bounds are not
+estimated."""
 
 
 def complete_scene(folder: Path, say: Callable[[str], None]) -> None:
@@ -80,9 +76,7 @@ def write_estimate(estimate: Estimate, path: Path, completed: Scene | None = Non
     if completed is not None:
         # Writing the whole scene would lose the entries of missing frames.
         scene_json = completed.folder / "scene.json"
-        cameras = estimate.trajectory.poses.position.numpy()
-        bounds = bounds_around(estimate.points, cameras, estimate.quality.distant_share)
-        write_json(scene_json, {**read_json(scene_json), "bounds": bounds})
+        write_json(scene_json, {**read_json(scene_json), "bounds": estimated_bounds(estimate)})
     write_tum(path, estimate.trajectory, comments)
 
 
@@ -121,13 +115,19 @@ def sentences(estimate: Estimate, completed: Scene | None = None) -> list[str]:
     ]
 
 
-def bounds_around(
-    points: Float64[np.ndarray, "points 3"], cameras: Float64[np.ndarray, "keyframes 3"], distant_share: float
-) -> Corners | None:
-    """Return the corners of a box around the cameras and nearly all points, or None if the scene may extend further."""
-    if len(points) < _FEWEST_FOR_BOUNDS or distant_share > _MOST_DISTANT:
+def estimated_bounds(estimate: Estimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Return the corners of a box around the cameras and nearly all points.
+
+    None if the scene may extend further, or is so deep that contracted space shows what is near in more detail.
+    """
+    if len(estimate.points) < _FEWEST_FOR_BOUNDS or estimate.quality.distant_share > _MOST_DISTANT:
         return None
-    lower, upper = np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    cameras = estimate.trajectory.poses.position.numpy()
+    some = cameras[:: max(1, len(cameras) // 50)]
+    distance = np.linalg.norm(estimate.points[:, None] - some, axis=-1)
+    if np.quantile(np.median(distance, axis=1), 1 - _OUTSIDE) > _DEEPEST * np.quantile(distance.min(axis=1), 0.1):
+        return None
+    lower, upper = np.quantile(estimate.points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
     lower, upper = np.minimum(lower, cameras.min(axis=0)), np.maximum(upper, cameras.max(axis=0))
     margin = _MARGIN * float((upper - lower).max())
     return tuple((lower - margin).tolist()), tuple((upper + margin).tolist())

@@ -330,3 +330,9 @@ def test_inspection_refuses_polarities_that_processing_refuses(tmp_path: Path, p
     np.savez(tmp_path / "a.npz", t=np.arange(40), x=np.arange(40) % 7, y=np.arange(40) % 5, p=np.tile(p, 20))
     with pytest.raises(RecordingError, match="expected 0 .darker. and 1 .brighter., or -1 and 1"):
         inspect_recording(lambda: open_recording(tmp_path / "a.npz"))
+
+
+def test_an_npy_file_of_python_objects_is_not_unpickled(tmp_path: Path):
+    np.save(tmp_path / "a.npy", np.array(dict(zip("txyp", columns(), strict=True))), allow_pickle=True)
+    with pytest.raises(RecordingError, match="Python objects inside"):
+        open_recording(tmp_path / "a.npy")

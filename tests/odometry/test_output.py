@@ -53,6 +53,14 @@ def test_a_scene_that_may_extend_further_has_no_bounds(tiny_scene: Path, tmp_pat
     assert read_scene(scene.folder).bounds is None
 
 
+def test_a_deep_scene_has_no_bounds(tiny_scene: Path, tmp_path: Path):
+    scene = without_trajectory(tiny_scene, tmp_path / "scene")
+    rng = np.random.default_rng(0)
+    table, wall = rng.uniform(-1, 1, (300, 3)), rng.uniform(-8, 8, (100, 3)) + [0, 30, 0]
+    write_estimate(estimate_of(tiny_scene, np.concatenate([table, wall])), scene.trajectory, scene)
+    assert read_scene(scene.folder).bounds is None
+
+
 def test_bounds_of_another_frame_do_not_stay(tiny_scene: Path, tmp_path: Path):
     scene = without_trajectory(tiny_scene, tmp_path / "scene")
     estimate = estimate_of(tiny_scene, np.zeros((0, 3)), replace(QUALITY, kind="rotation only", disagreement=None))

@@ -245,6 +245,9 @@ def _npy(path: Path) -> Iterator[Arrays]:
         array = np.load(path, mmap_mode="r")
     except Exception as error:
         # NumPy evaluates the header as Python: a damaged one can raise any exception.
+        if "Python objects" in str(error):
+            reason = "Python objects inside, which can run code; expected arrays of numbers, or an npz of them"
+            raise RecordingError(f"{path}: {reason}") from None
         raise RecordingError(f"{path}: not a whole npy file of a plain array ({error})") from None
     if not isinstance(array, np.ndarray):
         raise RecordingError(f"{path}: not an npy file, expected rows of x, y, t and polarity")
