@@ -26,7 +26,7 @@ from ebarf_ns.scene import Scene, check_bounds, check_clocks, events_left_out, r
 _FEW_EVENTS_PER_PIXEL = 5
 _FEW_PIXELS = 0.005
 # Beyond these fields of view, a focal length in the wrong unit is more likely than such a lens.
-_DEEP = 3.0
+_DEEP = 2.5
 _WIDEST_DEG, _WIDEST_FISHEYE_DEG, _NARROWEST_DEG = 150, 240, 2
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from functools import lru_cache
+from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,9 +35,11 @@ class KeyframeAdam(torch.optim.Optimizer):
     preconditioner of Bramble, Pasciak & Xu 1990): P C_P^(-1/2) P^T times the mean gradient, where each row of P^T is
     the hat function of one stretch. Without ``stretches``, and for rows of one parameter, this is Adam.
 
-    ``eps`` is added to each eigenvalue as a share of the matrix's mean diagonal. Inverse roots are recomputed for at
-    most 256 rows and stretches per step, in turn; rows do not move before their first one. Without ``coupled``, each
-    parameter is scaled separately. A ``power`` below 1/2, C^(-power), moves poorly constrained directions less.
+    ``eps`` is added to each eigenvalue as a share of the matrix's mean diagonal. Inverse roots of matrices of mean
+    diagonal 1 are recomputed for at most 256 rows and stretches per step, in turn; rows do not move before their first
+    one. The mean diagonal itself is always current, and no step is longer than it could be with a current root: while
+    the field is young, gradients grow tenfold in a few steps. Without ``coupled``, each parameter is scaled separately.
+    A ``power`` below 1/2, C^(-power), moves poorly constrained directions less.
     """
 
     def __init__(
@@ -71,15 +74,24 @@ class KeyframeAdam(torch.optim.Optimizer):
         if not state:
             state["step"] = 0
             state["mean"] = torch.zeros_like(gradient)
-            state["outer"], state["root"] = (gradient.new_zeros(count, dim, dim) for _ in range(2))
-        step, outer, root = state["step"], state["outer"], state["root"]
+            state["outer"] = gradient.new_zeros(count, dim, dim)
+        # Checkpoints of earlier versions have roots that include the scale.
+        if "unit_root" not in state:
+            state["unit_root"] = gradient.new_zeros(count, dim, dim)
+        step, outer, root = state["step"], state["outer"], state["unit_root"]
         state["mean"].lerp_(gradient, 1 - beta1)
         outer.lerp_(gradient[:, :, None] * gradient[:, None, :], 1 - beta2)
         due = (step * _ROOTS_A_STEP + torch.arange(min(count, _ROOTS_A_STEP), device=rows.device)) % count
+        size = outer.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+        known = size > 0
+        size = torch.where(known, size, torch.ones_like(size))
         seen = outer[due] if self.coupled else outer[due] * torch.eye(dim).to(outer)
-        root[due] = _inverse_power(seen / (1 - beta2 ** (step + 1)), eps, self.power)
+        root[due] = _inverse_power(seen / size[due, None, None], eps, self.power)
         state["step"] = step + 1
-        direction = (root @ (state["mean"] / (1 - beta1 ** (step + 1)))[..., None])[..., 0]
+        mean = state["mean"] / (1 - beta1 ** (step + 1)) * (size / (1 - beta2 ** (step + 1))).rsqrt()[:, None]
+        direction = known[:, None] * (root @ mean[..., None])[..., 0]
+        longest = _longest(beta1, beta2) * dim ** ((0.5 if self.coupled else 1.0) - self.power)
+        direction = direction / (direction.norm(dim=-1, keepdim=True) / longest).clamp_min(1)
         return direction if onto_rows is None else onto_rows @ direction
 
 
@@ -115,10 +127,16 @@ def _as_tensor(sparse: csr_matrix, device: torch.device, dtype: torch.dtype) -> 
         return torch.sparse_csr_tensor(*parts, size=sparse.shape, dtype=dtype, device=device, check_invariants=True)
 
 
+def _longest(beta1: float, beta2: float) -> float:
+    """Upper bound of |C^(-1/2) m| for the moving averages m of gradients and C of their outer products.
+
+    By Cauchy and Schwarz, m' C⁻¹ m is at most the sum of squared weights in m over those in C.
+    """
+    ratio = beta1**2 / beta2
+    return (1 - beta1) / sqrt((1 - beta2) * (1 - ratio)) if ratio < 1 else 1e30
+
+
 def _inverse_power(outer: Float[Tensor, "rows dim dim"], eps: float, power: float) -> Float[Tensor, "rows dim dim"]:
-    """(C + eps)^-power for C normalised to mean diagonal 1, then rescaled like C^(-1/2); 0 if C is 0."""
-    size = outer.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
-    safe = torch.where(size > 0, size, torch.ones_like(size))[:, None, None]
-    spread, direction = torch.linalg.eigh(outer / safe)
-    scale = torch.where(size > 0, safe[:, 0, 0].rsqrt(), torch.zeros_like(size))[:, None, None]
-    return scale * direction @ ((spread.clamp_min(0) + eps).pow(-power)[..., None] * direction.mT)
+    """(C + eps)^-power for matrices C of mean diagonal 1, or 0."""
+    spread, direction = torch.linalg.eigh(outer)
+    return direction @ ((spread.clamp_min(0) + eps).pow(-power)[..., None] * direction.mT)

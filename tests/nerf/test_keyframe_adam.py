@@ -139,3 +139,36 @@ def test_its_state_resumes_exactly(count: int):
             other = KeyframeAdam([stopped])
             other.load_state_dict(state)
     assert torch.equal(whole, stopped)
+
+
+@pytest.mark.parametrize("power", [0.5, 0.25])
+def test_many_rows_whose_gradients_grow_tenfold_in_every_step_do_not_run_away(power: float):
+    """Their inverse roots are computed in turn, and are out of date for ten steps and more."""
+    generator = torch.Generator().manual_seed(0)
+    few, many = rows_of(torch.zeros(40, 6)), rows_of(torch.zeros(2000, 6))
+    furthest = []
+    for rows in (few, many):
+        optimizer = KeyframeAdam([rows], lr=0.01, power=power)
+        for step in range(30):
+            rows.grad = 10.0 ** min(step - 10, 5) * torch.randn(rows.shape, generator=generator)
+            optimizer.step()
+        furthest.append(float(rows.detach().abs().max()))
+    assert furthest[1] < 10 * furthest[0] < 10
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+@pytest.mark.parametrize("power", [0.5, 0.25, 0.0])
+def test_no_step_of_a_row_with_a_current_root_is_cut_short(
+    power: float, coupled: bool, monkeypatch: pytest.MonkeyPatch
+):
+    ends = []
+    for _ in range(2):
+        generator = torch.Generator().manual_seed(0)
+        rows = rows_of(torch.zeros(30, 6))
+        optimizer = KeyframeAdam([rows], power=power, eps=1e-6, coupled=coupled)
+        for step in range(60):
+            rows.grad = (1 + step % 20) ** 3 * torch.randn(rows.shape, generator=generator).cumsum(dim=-1)
+            optimizer.step()
+        ends.append(rows.detach().clone())
+        monkeypatch.setattr("ebarf_ns.nerf.keyframe_adam._longest", lambda *betas: 1e30)
+    assert torch.equal(*ends)
