@@ -1,15 +1,12 @@
-"""Errors of a trajectory against a reference, computed with the evo library."""
+"""Errors of a trajectory against a reference, as computed by the evo library."""
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from evo.core import metrics
-from evo.core.geometry import GeometryException
-from evo.core.lie_algebra import se3
-from evo.core.trajectory import PosePath3D
+from evo.core.geometry import GeometryException, umeyama_alignment
 from jaxtyping import Float, Int64
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
@@ -20,7 +17,7 @@ from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_
 
 # Motion counts as a line if its extent across the main direction is below this share of that along it.
 _THINNEST = 0.01
-_ALTERNATIONS = 20
+_ALTERNATIONS, _CONVERGED_RAD = 20, 1e-9
 Alignment = Literal["se3", "sim3", "orientation"]
 ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
 """Suffix of a result's name for each alignment."""
@@ -52,69 +49,74 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     return _error(estimate, reference, alignment, _rotation_errors_deg(estimate, reference))
 
 
+class _Path(NamedTuple):
+    """Matched poses; evo's own path is a list of matrices, and slow for 100,000 of them."""
+
+    position: Float[np.ndarray, "poses 3"]
+    rotation: Rotation
+
+
+class _Similarity(NamedTuple):
+    """x -> scale R x + shift."""
+
+    rotation: Rotation
+    shift: Float[np.ndarray, "3"]
+    scale: float
+
+    def __call__(self, path: _Path) -> _Path:
+        return _Path(self.scale * self.rotation.apply(path.position) + self.shift, self.rotation * path.rotation)
+
+
 def _error(
     estimate: Trajectory, reference: Trajectory, alignment: Alignment, rotations_deg: tuple[float, float]
 ) -> TrajectoryError:
     estimated, true = _matched(estimate, reference)
     if alignment == "orientation":
-        _, _, scale = _align_by_orientation(estimated, true)
+        aligned_by = _align_by_orientation(estimated, true)
     else:
-        _, _, scale = _umeyama(estimated, true, correct_scale=alignment == "sim3")
-    position_error, full_error = (
-        _absolute_error(estimated, true, relation)
-        for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.full_transformation)
-    )
+        aligned_by = _umeyama(estimated, true, with_scale=alignment == "sim3")
+    aligned = aligned_by(estimated)
+    apart = np.linalg.norm(aligned.position - true.position, axis=1)
+    # The Frobenius norm of a rotation by an angle minus the identity.
+    turned = np.sqrt(8) * np.sin((aligned.rotation.inv() * true.rotation).magnitude() / 2)
     return TrajectoryError(
-        ate_m=float(position_error.get_statistic(metrics.StatisticsType.rmse)),
+        ate_m=float(np.sqrt(np.mean(apart**2))),
         rotation_deg=rotations_deg[0],
         rotation_deg_body=rotations_deg[1],
-        ape_full=float(full_error.get_statistic(metrics.StatisticsType.mean)),
-        scale=float(scale),
-        matched=int(estimated.num_poses),
+        ape_full=float(np.hypot(turned, apart).mean()),
+        scale=aligned_by.scale,
+        matched=len(apart),
     )
 
 
-def _umeyama(estimated: PosePath3D, true: PosePath3D, correct_scale: bool) -> tuple[np.ndarray, np.ndarray, float]:
-    """Align in place; raises :class:`EvaluationError` for positions on a line, which leave rotations about it open."""
+def _umeyama(estimated: _Path, true: _Path, with_scale: bool) -> _Similarity:
+    """Raises :class:`EvaluationError` for positions on a line, which leave rotations about it open."""
     for path in (estimated, true):
-        extent = np.linalg.svd(path.positions_xyz - path.positions_xyz.mean(axis=0), compute_uv=False)
+        extent = np.linalg.svd(path.position - path.position.mean(axis=0), compute_uv=False)
         if extent[1] <= _THINNEST * extent[0]:
             raise EvaluationError(
-                f"the trajectory cannot be aligned to the reference: the {path.num_poses} matched positions of one lie "
-                "on a line or in a point, expected motion in at least 2 directions"
+                f"the trajectory cannot be aligned to the reference: the {len(path.position)} matched positions of one "
+                "lie on a line or in a point, expected motion in at least 2 directions"
             )
     try:
-        return estimated.align(true, correct_scale=correct_scale)
+        rotation, shift, scale = umeyama_alignment(estimated.position.T, true.position.T, with_scale)
     except GeometryException as error:
         raise EvaluationError(f"the trajectory cannot be aligned to the reference: {error}") from None
+    return _Similarity(Rotation.from_matrix(rotation), shift, float(scale))
 
 
-def _absolute_error(estimated: PosePath3D, true: PosePath3D, relation: metrics.PoseRelation) -> metrics.APE:
-    error = metrics.APE(relation)
-    error.process_data((true, estimated))
-    return error
-
-
-def _align_by_orientation(estimated: PosePath3D, true: PosePath3D) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotate, scale and shift ``estimated`` in place; returns the rotation, the shift after both, and the scale."""
-    world = (_rotations(true) * _rotations(estimated).inv()).mean()
-    moved = world.apply(estimated.positions_xyz)
-    offset, goal = moved - moved.mean(axis=0), true.positions_xyz - true.positions_xyz.mean(axis=0)
-    still = 1e-12 * max(float(np.abs(moved).max()), float(np.abs(true.positions_xyz).max()), 1e-300)
+def _align_by_orientation(estimated: _Path, true: _Path) -> _Similarity:
+    """Rotates by the mean difference of the rotations; raises :class:`EvaluationError` without motion."""
+    world = (true.rotation * estimated.rotation.inv()).mean()
+    moved = world.apply(estimated.position)
+    offset, goal = moved - moved.mean(axis=0), true.position - true.position.mean(axis=0)
+    still = 1e-12 * max(float(np.abs(moved).max()), float(np.abs(true.position).max()), 1e-300)
     if np.abs(offset).max() <= still or np.abs(goal).max() <= still:
         raise EvaluationError("the trajectory or its reference does not move, expected motion to align")
     scale = float((offset * goal).sum() / (offset**2).sum())
     if scale <= 0:
         raise EvaluationError("the trajectory moves against its reference, no positive scale aligns them")
-    shift = true.positions_xyz.mean(axis=0) - scale * moved.mean(axis=0)
-    estimated.transform(se3(world.as_matrix(), np.zeros(3)))
-    estimated.scale(scale)
-    estimated.transform(se3(np.eye(3), shift))
-    return world.as_matrix(), shift, scale
-
-
-def _rotations(path: PosePath3D) -> Rotation:
-    return Rotation.from_quat(path.orientations_quat_wxyz[:, [1, 2, 3, 0]])
+    return _Similarity(world, true.position.mean(axis=0) - scale * moved.mean(axis=0), scale)
 
 
 def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
@@ -123,12 +125,12 @@ def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
     Raises :class:`EvaluationError` for fewer than 3 poses within the reference's span.
     """
     estimated, true = _matched(estimate, reference)
-    return _rotation_error_deg(_rotations(estimated), _rotations(true), with_body=False)
+    return _rotation_error_deg(estimated.rotation, true.rotation, with_body=False)
 
 
 def _rotation_errors_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
     """The rotation error, without and with a constant rotation of the body fitted."""
-    turned, straight = map(_rotations, _matched(estimate, reference))
+    turned, straight = (path.rotation for path in _matched(estimate, reference))
     return _rotation_error_deg(turned, straight, False), _rotation_error_deg(turned, straight, True)
 
 
@@ -139,9 +141,8 @@ def rotation_errors_by_positions_deg(estimate: Trajectory, reference: Trajectory
     distinguish them. Raises :class:`EvaluationError` if the positions are on a line.
     """
     estimated, true = _matched(estimate, reference)
-    turned = _rotations(estimated)
-    world, _, _ = _umeyama(estimated, true, correct_scale=True)
-    difference = (Rotation.from_matrix(world) * turned).inv() * _rotations(true)
+    aligned = _umeyama(estimated, true, with_scale=True)(estimated)
+    difference = aligned.rotation.inv() * true.rotation
     return _spread_deg(difference), _spread_deg(difference.mean().inv() * difference)
 
 
@@ -154,8 +155,10 @@ def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> 
     body = _body(estimate, true) if with_body else Rotation.identity()
     world = (true * (estimate * body).inv()).mean()
     for _ in range(_ALTERNATIONS if with_body else 0):
-        body = ((world * estimate).inv() * true).mean()
+        before, body = body, ((world * estimate).inv() * true).mean()
         world = (true * (estimate * body).inv()).mean()
+        if (before.inv() * body).magnitude() < _CONVERGED_RAD:
+            break
     return _spread_deg((world * estimate * body).inv() * true)
 
 
@@ -171,7 +174,7 @@ def _body(estimate: Rotation, true: Rotation) -> Rotation:
         return Rotation.align_vectors(of_estimate, of_true)[0]
 
 
-def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, PosePath3D]:
+def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[_Path, _Path]:
     t_us, reference_t_us = estimate.t_us.numpy(), reference.t_us.numpy()
     inside = (t_us >= reference_t_us[0]) & (t_us <= reference_t_us[-1])
     if inside.sum() < 3:
@@ -184,32 +187,21 @@ def _matched(estimate: Trajectory, reference: Trajectory) -> tuple[PosePath3D, P
     reference_t = (reference_t_us - reference_t_us[0]).astype(float)
     reference_position, reference_quat_wxyz = (column.double().numpy() for column in reference.poses)
     position = np.stack([np.interp(t, reference_t, axis) for axis in reference_position.T], axis=1)
-    quat_xyzw = Slerp(reference_t, Rotation.from_quat(reference_quat_wxyz[:, [1, 2, 3, 0]]))(t).as_quat()
+    rotation = Slerp(reference_t, Rotation.from_quat(reference_quat_wxyz[:, [1, 2, 3, 0]]))(t)
     estimated_position, estimated_quat_wxyz = (column.double().numpy()[inside] for column in estimate.poses)
     return (
-        PosePath3D(estimated_position.copy(), estimated_quat_wxyz.copy()),
-        PosePath3D(position, quat_xyzw[:, [3, 0, 1, 2]]),
+        _Path(estimated_position, Rotation.from_quat(estimated_quat_wxyz[:, [1, 2, 3, 0]])),
+        _Path(position, rotation),
     )
-
-
-def orientation_alignment(
-    estimate: Trajectory, reference: Trajectory
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
-    """The rotation, the shift and the scale s of the ``orientation`` alignment: x -> s R x + shift.
-
-    Raises :class:`EvaluationError` as :func:`trajectory_error` does.
-    """
-    return _align_by_orientation(*_matched(estimate, reference))
 
 
 def aligned_positions(estimate: Trajectory, reference: Trajectory) -> Float[np.ndarray, "keyframes 3"]:
     """The estimate's positions aligned by orientation and scale, for plots; unchanged if that is undefined."""
     try:
         estimated, true = _matched(estimate, reference)
-        _align_by_orientation(estimated, true)
+        return _align_by_orientation(estimated, true)(estimated).position
     except EvaluationError:
         return estimate.poses.position.double().numpy()
-    return np.asarray(estimated.positions_xyz)
 
 
 def trajectory_results(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
@@ -259,21 +251,25 @@ def errors_over_time(estimate: Trajectory, reference: Trajectory) -> ErrorsOverT
     """The error of each pose within the reference's span; None if no alignment is defined."""
     try:
         estimated, true = _matched(estimate, reference)
-        turned, straight = _rotations(estimated), _rotations(true)
-        try:
-            _umeyama(estimated, true, correct_scale=True)
-        except EvaluationError:
-            _align_by_orientation(estimated, true)
+        aligned = _aligned(estimated, true)(estimated)
     except EvaluationError:
         return None
-    world = (straight * turned.inv()).mean()
+    world = (true.rotation * estimated.rotation.inv()).mean()
     t_us = estimate.t_us.numpy()
     inside = (t_us >= int(reference.t_us[0])) & (t_us <= int(reference.t_us[-1]))
     return ErrorsOverTime(
         t_us[inside],
-        np.linalg.norm(np.asarray(estimated.positions_xyz) - np.asarray(true.positions_xyz), axis=1),
-        np.degrees(((world * turned).inv() * straight).magnitude()),
+        np.linalg.norm(aligned.position - true.position, axis=1),
+        np.degrees(((world * estimated.rotation).inv() * true.rotation).magnitude()),
     )
+
+
+def _aligned(estimated: _Path, true: _Path) -> _Similarity:
+    """The sim3 alignment, or that by orientation and scale where it is undefined."""
+    try:
+        return _umeyama(estimated, true, with_scale=True)
+    except EvaluationError:
+        return _align_by_orientation(estimated, true)
 
 
 def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_us: Int64[Tensor, "times"]) -> Poses:
@@ -288,12 +284,8 @@ def reference_in_estimates_world(estimate: Trajectory, reference: Trajectory, t_
             f"no reference pose at {int(outside[0])} us, expected a time from {int(reference.t_us[0])} to "
             f"{int(reference.t_us[-1])} us, the reference's span"
         )
-    estimated, true = _matched(estimate, reference)
-    try:
-        rotation, shift, scale = _umeyama(estimated, true, correct_scale=True)
-    except EvaluationError:
-        rotation, shift, scale = _align_by_orientation(estimated, true)
+    aligned_by = _aligned(*_matched(estimate, reference))
     poses = interpolate(reference.t_us, reference.poses, t_us)
-    back = torch.from_numpy(Rotation.from_matrix(rotation.T).as_quat()[[3, 0, 1, 2]]).expand(len(t_us), 4)
-    position = rotate(back, poses.position - torch.from_numpy(shift)) / float(scale)
+    back = torch.from_numpy(aligned_by.rotation.inv().as_quat()[[3, 0, 1, 2]]).expand(len(t_us), 4)
+    position = rotate(back, poses.position - torch.from_numpy(aligned_by.shift)) / aligned_by.scale
     return Poses(position, quat_wxyz_multiply(back, poses.quat_wxyz))

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from evo.core import metrics
+from evo.core.trajectory import PosePath3D
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -142,3 +144,23 @@ def test_errors_are_those_of_evos_command_line(tmp_path: Path, alignment: str, f
         subprocess.run(command, check=True, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
         with zipfile.ZipFile(tmp_path / f"{relation}.zip") as results:
             assert mine == pytest.approx(json.loads(results.read("stats.json"))[statistic], abs=1e-9)
+
+
+@pytest.mark.parametrize(("alignment", "with_scale"), [("se3", False), ("sim3", True)])
+def test_errors_are_those_of_evo(alignment: str, with_scale: bool):
+    position, turn = wander()
+    random = np.random.default_rng(5)
+    noisy = (
+        position + 0.05 * random.standard_normal(position.shape),
+        turn * Rotation.from_rotvec(0.02 * random.standard_normal(position.shape)),
+    )
+    ours = trajectory_error(make(*noisy), make(position, turn), alignment)  # pyright: ignore[reportArgumentType]
+    estimate, true = (PosePath3D(x, q.as_quat()[:, [3, 0, 1, 2]]) for x, q in (noisy, (position, turn)))
+    estimate.align(true, correct_scale=with_scale)
+    theirs = []
+    for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.full_transformation):
+        error = metrics.APE(relation)
+        error.process_data((true, estimate))
+        theirs.append(error)
+    assert ours.ate_m == pytest.approx(theirs[0].get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
+    assert ours.ape_full == pytest.approx(theirs[1].get_statistic(metrics.StatisticsType.mean), rel=1e-9)
