@@ -46,9 +46,10 @@ def compare_files(estimate: Path, reference: Path, known: TrajectoryFormat = NOT
     errors, reasons = errors_under_each_alignment(estimated, true)
     if not errors:
         raise EvaluationError(f"{estimate}: {next(iter(reasons.values()))}")
+    body_deg = rotation_error_deg(estimated, true, with_body=True)
     comparison: dict[str, Any] = {alignment: None for alignment in ALIGNMENTS}
     for alignment, error in errors.items():
-        comparison[alignment] = vars(error).copy()
+        comparison[alignment] = {**vars(error), "rotation_deg_body": body_deg}
         comparison["matched"] = comparison[alignment].pop("matched")
     notes = said + notes + [f"{alignment}: {reason}" for alignment, reason in reasons.items()]
     return {**comparison, "scale": errors["sim3"].scale if "sim3" in errors else None, "notes": notes}

@@ -17,7 +17,7 @@ from ebarf_ns.geometry.trajectory import Poses, Trajectory, interpolate, within_
 
 # Motion counts as a line if its extent across the main direction is below this share of that along it.
 _THINNEST = 0.01
-_ALTERNATIONS, _CONVERGED_RAD = 20, 1e-9
+_ALTERNATIONS = 20
 Alignment = Literal["se3", "sim3", "orientation"]
 ALIGNMENTS: dict[Alignment, str] = {"sim3": "", "se3": "_se3", "orientation": "_orientation"}
 """Suffix of a result's name for each alignment."""
@@ -31,8 +31,6 @@ class TrajectoryError:
     """RMS position error."""
     rotation_deg: float
     """RMS rotation error after the world rotation that fits the rotations best, not that of ate_m."""
-    rotation_deg_body: float
-    """The same, with a constant rotation of the body also fitted."""
     ape_full: float
     """Mean of evo's unit-less full transformation error, the number of the E-BARF paper's Table 2."""
     scale: float
@@ -46,7 +44,7 @@ def trajectory_error(estimate: Trajectory, reference: Trajectory, alignment: Ali
     rotations and fits position and scale, which is also defined for motion along a line. Raises
     :class:`EvaluationError` if the alignment is undefined: fewer than 3 poses, no motion, or for Umeyama's a line.
     """
-    return _error(estimate, reference, alignment, _rotation_errors_deg(estimate, reference))
+    return _error(estimate, reference, alignment, rotation_error_deg(estimate, reference))
 
 
 class _Path(NamedTuple):
@@ -67,9 +65,7 @@ class _Similarity(NamedTuple):
         return _Path(self.scale * self.rotation.apply(path.position) + self.shift, self.rotation * path.rotation)
 
 
-def _error(
-    estimate: Trajectory, reference: Trajectory, alignment: Alignment, rotations_deg: tuple[float, float]
-) -> TrajectoryError:
+def _error(estimate: Trajectory, reference: Trajectory, alignment: Alignment, rotation_deg: float) -> TrajectoryError:
     estimated, true = _matched(estimate, reference)
     if alignment == "orientation":
         aligned_by = _align_by_orientation(estimated, true)
@@ -81,8 +77,7 @@ def _error(
     turned = np.sqrt(8) * np.sin((aligned.rotation.inv() * true.rotation).magnitude() / 2)
     return TrajectoryError(
         ate_m=float(np.sqrt(np.mean(apart**2))),
-        rotation_deg=rotations_deg[0],
-        rotation_deg_body=rotations_deg[1],
+        rotation_deg=rotation_deg,
         ape_full=float(np.hypot(turned, apart).mean()),
         scale=aligned_by.scale,
         matched=len(apart),
@@ -119,19 +114,14 @@ def _align_by_orientation(estimated: _Path, true: _Path) -> _Similarity:
     return _Similarity(world, true.position.mean(axis=0) - scale * moved.mean(axis=0), scale)
 
 
-def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
-    """The rotation error of :class:`TrajectoryError`, which needs no motion.
+def rotation_error_deg(estimate: Trajectory, reference: Trajectory, with_body: bool = False) -> float:
+    """The rotation error of :class:`TrajectoryError`, which needs no motion; ``with_body``: a constant rotation of the
+    body is fitted as well as that of the world.
 
     Raises :class:`EvaluationError` for fewer than 3 poses within the reference's span.
     """
     estimated, true = _matched(estimate, reference)
-    return _rotation_error_deg(estimated.rotation, true.rotation, with_body=False)
-
-
-def _rotation_errors_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
-    """The rotation error, without and with a constant rotation of the body fitted."""
-    turned, straight = (path.rotation for path in _matched(estimate, reference))
-    return _rotation_error_deg(turned, straight, False), _rotation_error_deg(turned, straight, True)
+    return _rotation_error_deg(estimated.rotation, true.rotation, with_body)
 
 
 def rotation_errors_by_positions_deg(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
@@ -155,10 +145,8 @@ def _rotation_error_deg(estimate: Rotation, true: Rotation, with_body: bool) -> 
     body = _body(estimate, true) if with_body else Rotation.identity()
     world = (true * (estimate * body).inv()).mean()
     for _ in range(_ALTERNATIONS if with_body else 0):
-        before, body = body, ((world * estimate).inv() * true).mean()
+        body = ((world * estimate).inv() * true).mean()
         world = (true * (estimate * body).inv()).mean()
-        if (before.inv() * body).magnitude() < _CONVERGED_RAD:
-            break
     return _spread_deg((world * estimate * body).inv() * true)
 
 
@@ -227,12 +215,12 @@ def errors_under_each_alignment(
     """The errors of each defined alignment, and the reason for each undefined one."""
     errors, reasons = {}, {}
     try:
-        rotations_deg = _rotation_errors_deg(estimate, reference)
+        rotation_deg = rotation_error_deg(estimate, reference)
     except EvaluationError as problem:
         return {}, dict.fromkeys(ALIGNMENTS, str(problem))
     for alignment in ALIGNMENTS:
         try:
-            errors[alignment] = _error(estimate, reference, alignment, rotations_deg)
+            errors[alignment] = _error(estimate, reference, alignment, rotation_deg)
         except EvaluationError as problem:
             reasons[alignment] = str(problem)
     return errors, reasons
