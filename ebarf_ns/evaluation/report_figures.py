@@ -31,6 +31,8 @@ CURVES = {
 }
 _POSITION = ("ate_m", "ate_m_orientation")
 _LARGEST_EVENTS = 4
+# Of longer trajectories, poses are drawn at even distances: markers make an SVG large, and slow to write.
+_MOST_POINTS = 2000
 
 
 class Drawn(NamedTuple):
@@ -59,8 +61,9 @@ def drawn(initial: Trajectory, refined: Trajectory, reference: Trajectory | None
         if reference and name != "reference":
             shown, position = within(one, reference), aligned_positions(one, reference)
             shown = shown if len(shown.t_us) == len(position) else one
-        rotation = Rotation.from_quat(shown.poses.quat_wxyz.double().numpy()[:, [1, 2, 3, 0]])
-        found.append(Drawn(name, colour, line, shown.t_us.numpy() * 1e-6, position, rotation))
+        some = slice(None, None, -(-len(position) // _MOST_POINTS) or 1)
+        rotation = Rotation.from_quat(shown.poses.quat_wxyz.double().numpy()[some][:, [1, 2, 3, 0]])
+        found.append(Drawn(name, colour, line, shown.t_us.numpy()[some] * 1e-6, position[some], rotation))
     return found
 
 

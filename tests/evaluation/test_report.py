@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ebarf_ns.evaluation.report import write_report
+from ebarf_ns.evaluation.report_figures import drawn
 from ebarf_ns.evaluation.verdict import verdict
 from ebarf_ns.geometry.trajectory import Poses, Trajectory
 from ebarf_ns.geometry.trajectory_file import write_tum
@@ -134,3 +135,12 @@ def test_renders_that_do_not_follow_the_frames_are_doubtful():
     found = verdict({"heldout_event_loss": 0.28, "log_correlation": 0.41})
     assert found.mark == "doubtful" and any("correlation 0.41" in one for one in found.reasons)
     assert verdict({"heldout_event_loss": 0.28, "log_correlation": 0.9}).mark == "good"
+
+
+def test_of_a_long_trajectory_only_some_poses_are_drawn():
+    t_us = torch.arange(50_000) * 20
+    quat_wxyz = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(t_us), 4)
+    long = Trajectory(t_us, Poses(torch.stack([t_us * 1e-6] * 3, dim=-1).double(), quat_wxyz))
+    for one in drawn(long, long, None):
+        assert 1000 < len(one.seconds) == len(one.position) == len(one.rotation) <= 2000
+        assert np.allclose(one.position[:, 0], one.seconds)
