@@ -25,8 +25,9 @@ from ebarf_ns.scene import Scene, check_bounds, check_clocks, events_left_out, r
 
 _FEW_EVENTS_PER_PIXEL = 5
 _FEW_PIXELS = 0.005
-# Beyond these fields of view, a focal length in the wrong unit is more likely than such a lens.
+# Rooms are below 2.1; bounds of 2.9 cost 2 dB, and of 4.4 cost 10.
 _DEEP = 2.5
+# Beyond these fields of view, a focal length in the wrong unit is more likely than such a lens.
 _WIDEST_DEG, _WIDEST_FISHEYE_DEG, _NARROWEST_DEG = 150, 240, 2
 
 
