@@ -15,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from ebarf_ns.cli.entry import entrypoint
+from tests import prepared
 
 # Before torch is loaded, here and in the commands that tests run: several processes share the cores, and threads that
 # spin while they wait for one another make steps twenty times as long.
@@ -51,6 +52,8 @@ def run_command(*words: object, timeout_s: float = 300, cwd: Path | None = None)
     name, *arguments = map(str, words)
     if name == "ebarf" and cwd is None:
         return _run_ebarf(arguments)
+    if prepared.AVAILABLE:
+        return Finished(*prepared.run_script(name, arguments, cwd, timeout_s))
     script = Path(sys.executable).parent / name
     environment = {**os.environ, "COLUMNS": "200", "PATH": f"{script.parent}{os.pathsep}{os.environ['PATH']}"}
     finished = subprocess.run(
