@@ -68,8 +68,10 @@ class Alignment:
         clock = f"clock off by {self.clock_offset_us / 1000:+.1f} ms, now corrected; " if self.clock_offset_us else ""
         if self.taken:
             return f"trajectory: {clock}off by {self.moved_px:.1f} px, training starts from the coarse alignment"
-        kind = "good to" if self.moved_px < _GOOD_PX else "with noise of"
-        return f"trajectory: {clock}{kind} {self.moved_px:.1f} px, training starts from it unchanged"
+        return (
+            f"trajectory: {clock}no large smooth error (a coarse field moves it by {self.moved_px:.1f} px), training "
+            "starts from it unchanged"
+        )
 
 
 def align(

@@ -40,7 +40,8 @@ _LEAST_VIEW, _FEWEST_MAPPED, _LEAST_SPAN = 0.45, 100, 0.5
 _LEAST_MOTION_PX, _NO_PARALLAX_PX, _ROTATION_PX, _LITTLE_PARALLAX_PX = 4.0, 0.8, 1.0, 1.5
 _LEAST_TRACK_SHARE = 0.3
 """Share of the keyframes that tracks must span on average to distinguish rotation from translation."""
-_LEAST_INLIERS = 0.6
+_LEAST_INLIERS = 0.75
+"""Recordings of one motion have 0.86 or more; two motions that share the features evenly have about 0.7."""
 _LEAST_GAIN, _LEAST_POINT_PARALLAX_PX = 1.5, 3.0
 """Least ratio of the errors of a rotation to those of a map; and parallax below which the distance of a point is not
 determined."""

@@ -22,6 +22,7 @@ _FEWEST_SHARED, _MOST_PAIRS, _AMPLE_PARALLAX_PX = 25, 6, 25.0
 _FEWEST_POINTS, _LEAST_INLIER_SHARE, _INLIER_PX = 12, 0.4, 3.0
 _LOCAL_KEYFRAMES, _CONTEXT_KEYFRAMES, _WHOLE_INTERVAL, _STRETCH = 8, 30, 12, 120
 _ROBUST_PX, _LOOSE_PX, _NUMBERS_PER_TRACK = 0.7, 2.0, 3
+_PNP_PX, _FARTHEST_PX = 2.0, 1e6
 _DEPTHS = np.array([0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 8.0])
 """Inverse depths at which a new point is tried, relative to the usual one."""
 
@@ -140,17 +141,7 @@ def _extend(whole: Map, current: int, step: int) -> bool:
     rows = np.nonzero((tracks.image == new) & whole.pointed[tracks.track])[0]
     if len(rows) < _FEWEST_POINTS:
         return False
-    previous = current - step
-    has_motion = whole.posed[previous] if 0 <= previous < len(whole.posed) else False
-    turn = bundle.rotation[current] @ bundle.rotation[previous].T if has_motion else np.eye(3)
-    bundle.rotation[new] = turn @ bundle.rotation[current]
-    bundle.centre[new] = 2 * bundle.centre[current] - bundle.centre[previous] if has_motion else bundle.centre[current]
-    only_new = np.arange(len(whole.posed)) == new
-    for robust_px in (4.0, 1.0):
-        adjust(
-            bundle, tracks.image[rows], tracks.track[rows], tracks.plane[rows], only_new, whole.focal_px, robust_px, 15,
-            points_too=False,
-        )  # fmt: skip
+    _estimate_pose(whole, rows, current, step)
     whole.posed[new] = True
     recent, context = (_posed_before(whole, new, step, count) for count in (_LOCAL_KEYFRAMES, _CONTEXT_KEYFRAMES))
     # This keyframe may be the first to determine the depth of a point, so outliers are rejected only afterwards.
@@ -163,6 +154,49 @@ def _extend(whole: Map, current: int, step: int) -> bool:
     _add_points(whole, usual=float(np.median(bundle.point[tracks.track[rows], 2])))
     _adjust(whole, recent, context, _ROBUST_PX, rounds=4)
     return True
+
+
+def _estimate_pose(whole: Map, rows: Int64[np.ndarray, "rows"], current: int, step: int) -> None:
+    """Set the pose of the next keyframe from these observations: the better of two, from two starting poses.
+
+    Constant velocity alone is a poor start where the motion turns: a planar part of the scene then holds the pose in a
+    local minimum, and the map breaks. Perspective-n-point needs no start, but some of the points to be accurate.
+    """
+    new, bundle, tracks = current + step, whole.bundle, whole.tracks
+    image, track, plane = tracks.image[rows], tracks.track[rows], tracks.plane[rows]
+    only_new = np.arange(len(whole.posed)) == new
+    best = np.inf
+    for rotation, centre in _starting_poses(whole, rows, current, step):
+        before = bundle.rotation[new].copy(), bundle.centre[new].copy()
+        bundle.rotation[new], bundle.centre[new] = rotation, centre
+        for robust_px in (4.0, 1.0):
+            adjust(bundle, image, track, plane, only_new, whole.focal_px, robust_px, 15, points_too=False)
+        error_px = whole.focal_px * np.linalg.norm(bundle.projected(image, track) - plane, axis=1)
+        cost = float(np.log1p(np.minimum(error_px, _FARTHEST_PX) ** 2).sum())
+        if cost < best:
+            best = cost
+        else:
+            bundle.rotation[new], bundle.centre[new] = before
+
+
+def _starting_poses(
+    whole: Map, rows: Int64[np.ndarray, "rows"], current: int, step: int
+) -> list[tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]]:
+    """Return rotations and centres to start from: by constant velocity, and by perspective-n-point if it succeeds."""
+    bundle, previous = whole.bundle, current - step
+    rotation, centre = bundle.rotation[current], bundle.centre[current]
+    starts = [(rotation, centre)]
+    if 0 <= previous < len(whole.posed) and whole.posed[previous]:
+        starts = [(rotation @ bundle.rotation[previous].T @ rotation, 2 * centre - bundle.centre[previous])]
+    points = bundle.positions()[whole.tracks.track[rows]] - centre
+    found, turn, shift, _ = cv2.solvePnPRansac(
+        points, whole.focal_px * whole.tracks.plane[rows], np.diag([whole.focal_px, whole.focal_px, 1.0]), None,
+        iterationsCount=200, reprojectionError=_PNP_PX, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if found and np.isfinite([turn, shift]).all():
+        rotation = Rotation.from_rotvec(turn[:, 0]).as_matrix()
+        starts.append((rotation, centre - rotation.T @ shift[:, 0]))
+    return starts
 
 
 def _posed_before(whole: Map, last: int, step: int, count: int) -> Int64[np.ndarray, "images"]:

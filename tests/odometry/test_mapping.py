@@ -9,7 +9,7 @@ from ebarf_ns.odometry.mapping import Map, halved, mapped
 from ebarf_ns.odometry.rotation import turned
 from ebarf_ns.odometry.tracks import Tracks
 from ebarf_ns.odometry.verdict import agreement, explained
-from tests.odometry.worlds import FOCAL_PX, motion, position_error_share, tracks_of
+from tests.odometry.worlds import FOCAL_PX, motion, position_error_share, tracks_along_a_wall, tracks_of
 
 KEYFRAMES = 24
 
@@ -66,10 +66,19 @@ def test_maps_find_the_path_also_where_tracks_leave_their_points(strays: float):
     rotation, centre = motion(KEYFRAMES)
     whole = mapped_whole(tracks_of(rotation, centre, strays=strays))
     assert whole.posed.all()
-    assert position_error_share(whole.bundle.centre, centre) < 0.02
+    assert position_error_share(whole.bundle.centre, centre) < 0.03
     relative = whole.bundle.rotation @ whole.bundle.rotation[0].T
     error = (Rotation.from_matrix(relative) * Rotation.from_matrix(rotation @ rotation[0].T).inv()).magnitude()
     assert np.degrees(error).max() < 1.0
+
+
+@pytest.mark.parametrize(("speed", "seed"), [(0.08, 1), (0.1, 5)])
+def test_a_map_survives_turning_points_in_front_of_a_wall(speed: float, seed: int):
+    tracks, centre = tracks_along_a_wall(45, speed, seed)
+    whole = mapped_whole(tracks)
+    assert whole.posed.all()
+    # Started from constant velocity alone, 7 and 5 %.
+    assert position_error_share(whole.bundle.centre, centre) < 0.03
 
 
 def test_a_map_of_two_motions_is_not_taken_for_one():
@@ -84,7 +93,10 @@ def test_a_map_of_two_motions_is_not_taken_for_one():
     rotation = turned(both)
     assert rotation is not None
     whole = mapped(both, FOCAL_PX, rotation)
-    assert whole is None or explained(whole, both).mean() < 0.5 or (whole.residuals_px() < 2).mean() < 0.65
+    assert whole is not None
+    inliers = (whole.residuals_px() < 2)[explained(whole, both)[both.image]].mean()
+    one_motion = mapped_whole(one)
+    assert inliers < 0.72 and (one_motion.residuals_px() < 2).mean() > 0.86
 
 
 def test_halves_agree_on_a_path_and_say_how_well():

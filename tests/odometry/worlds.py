@@ -45,6 +45,34 @@ def tracks_of(
     return tracks.select(tracks.lengths()[tracks.track] >= 3)
 
 
+def tracks_along_a_wall(keyframes: int, speed: float, seed: int) -> tuple[Tracks, np.ndarray]:
+    """Drifting tracks of points on a wall 3 away, and the centres of a camera that often turns back, unevenly fast."""
+    random = np.random.default_rng(seed)
+    there_and_back = np.where(np.arange(keyframes) % 20 < 10, 1.0, -0.7)
+    along = np.cumsum(there_and_back * speed * random.uniform(0.5, 1.5, keyframes))
+    centre = np.stack([along, 0.3 * np.sin(3 * along), 0.2 * np.cos(2 * along)], axis=1)
+    turn = np.stack([0.1 * np.sin(along), -0.25 * along, 0.05 * along], axis=1)
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    wall = np.stack([random.uniform(-6, 8, 1500), random.uniform(-3, 3, 1500), random.normal(3, 0.02, 1500)], axis=1)
+    rows, tracked, count = [], {}, 0
+    for image in range(keyframes):
+        seen = (wall - centre[image]) @ rotation[image].T
+        plane = seen[:, :2] / seen[:, 2:]
+        inside = (np.abs(plane) < [79 / FOCAL_PX, 59 / FOCAL_PX]).all(axis=1) & (seen[:, 2] > 0.1)
+        before, tracked = tracked, {}
+        for point in np.nonzero(inside)[0]:
+            track, first = before.get(point, (count, image))
+            if image - first >= 12 * random.uniform(0.5, 1.5):
+                track, first = count, image
+            count += track == count
+            tracked[point] = (track, first)
+            drift_px = 0.5 * np.array([np.sin(image), np.cos(1.3 * image)]) * (image - first) / 12
+            rows.append((track, image, *(plane[point] + (random.normal(0, 0.3, 2) + drift_px) / FOCAL_PX)))
+    table = np.array(rows)
+    tracks = Tracks(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    return tracks.select(tracks.lengths()[tracks.track] >= 3), centre
+
+
 def position_error_share(centre: np.ndarray, true: np.ndarray) -> float:
     """Root mean square after a similarity, over the extent of the path."""
     moved, goal = centre - centre.mean(axis=0), true - true.mean(axis=0)
