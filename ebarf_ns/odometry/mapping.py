@@ -190,7 +190,7 @@ def _starting_poses(
         starts = [(rotation @ bundle.rotation[previous].T @ rotation, 2 * centre - bundle.centre[previous])]
     points = bundle.positions()[whole.tracks.track[rows]] - centre
     found, turn, shift, _ = cv2.solvePnPRansac(
-        points, whole.focal_px * whole.tracks.plane[rows], np.diag([whole.focal_px, whole.focal_px, 1.0]), None,
+        points, whole.focal_px * whole.tracks.plane[rows], np.diag([whole.focal_px, whole.focal_px, 1.0]), np.zeros(4),
         iterationsCount=200, reprojectionError=_PNP_PX, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
     )  # fmt: skip
     if found and np.isfinite([turn, shift]).all():
