@@ -40,8 +40,8 @@ _NAMES: dict[str, tuple[str, str]] = {
     "psnr": ("PSNR", "{:.2f} dB"),
     "ssim": ("SSIM", "{:.3f}"),
     "lpips": ("LPIPS", "{:.3f}"),
-    "ate_m": ("position error, aligned by similarity, in the reference's unit", "{:.4f}"),
-    "ate_m_orientation": ("position error, aligned by orientation and scale", "{:.4f}"),
+    "ate_m": ("position error, aligned by similarity, in the reference's unit", "{:.3g}"),
+    "ate_m_orientation": ("position error, aligned by orientation and scale", "{:.3g}"),
     "rotation_deg": ("rotation error", "{:.3f}°"),
     "implied_threshold_on": ("threshold of brighter events that renders imply", "{:.3f}"),
     "implied_threshold_off": ("threshold of darker events that renders imply", "{:.3f}"),
@@ -194,7 +194,8 @@ def _numbers(evaluations: list[Record], given: Record) -> str:
     heads = "".join(f"<th>{name}" for name in ("", *["as given"] * judged, *range(1, len(evaluations)), "last"))
     every = _text(json.dumps(evaluations[-1], indent=1))
     # Omit the path of the weights, which is specific to this machine.
-    note = (lpips_note(evaluations[-1]) or "").split(" are not at ")[0]
+    note, weights, _ = (lpips_note(evaluations[-1]) or "").partition(" are not at ")
+    note += " are not installed" if weights else ""
     return (
         f"<div class=scroll><table><tr>{heads}{''.join(rows)}</table></div>{f'<p>{_text(note)}</p>' if note else ''}"
         f"<details><summary>all numbers of the last evaluation</summary><pre>{every}</pre></details>"

@@ -27,7 +27,7 @@ _MOST_VIEWS, _MOST_PIXELS = 40, 25_000
 _WIDEST_TAN = float(np.tan(np.radians(60)))
 _VOXELS, _MOST_VOXELS = 160, 60_000_000
 _EDGE_PERCENT, _MARGIN = 1.0, 0.02
-_TRY = "train longer, or raise --blur"
+_TRY = "train longer, or raise --blur; a camera that hardly translates does not determine distances"
 
 
 class Points(NamedTuple):
