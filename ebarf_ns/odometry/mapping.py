@@ -64,7 +64,7 @@ def mapped(tracks: Tracks, focal_px: float, turned: Turned) -> Map | None:
         while 0 <= current + step < len(best.posed) and _extend(best, current, step):
             current += step
             if current % _WHOLE_INTERVAL == 0:
-                _adjust_whole(best, rounds=6)
+                _adjust_newest(best, current, step)
     _adjust_whole(best, rounds=40)
     return best
 
@@ -237,6 +237,13 @@ def _add_points(whole: Map, usual: float) -> None:
         costs.append(np.bincount(row_point, np.log1p(squared)))
     bundle.point[new, 2] = usual * _DEPTHS[np.argmin(costs, axis=0)]
     whole.pointed[new] = True
+
+
+def _adjust_newest(whole: Map, current: int, step: int) -> None:
+    """Adjust the newest stretch of a growing map, so that time grows linearly; the map before it is fixed."""
+    newest = _posed_before(whole, current, step, _STRETCH)
+    free = newest[: -_STRETCH // 3] if len(newest) < whole.posed.sum() else np.sort(newest)[1:]
+    _adjust(whole, free, newest, _ROBUST_PX, rounds=6)
 
 
 def _adjust_whole(whole: Map, rounds: int) -> None:
