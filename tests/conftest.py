@@ -52,10 +52,10 @@ def run_command(*words: object, timeout_s: float = 300, cwd: Path | None = None)
     name, *arguments = map(str, words)
     if name == "ebarf" and cwd is None:
         return _run_ebarf(arguments)
-    if prepared.AVAILABLE:
-        return Finished(*prepared.run_script(name, arguments, cwd, timeout_s))
     script = Path(sys.executable).parent / name
     environment = {**os.environ, "COLUMNS": "200", "PATH": f"{script.parent}{os.pathsep}{os.environ['PATH']}"}
+    if prepared.AVAILABLE:
+        return Finished(*prepared.run_script(name, arguments, cwd, environment, timeout_s))
     finished = subprocess.run(
         [script, *arguments], capture_output=True, text=True, timeout=timeout_s, cwd=cwd, env=environment, check=False
     )

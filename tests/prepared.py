@@ -19,14 +19,15 @@ from unittest.mock import patch
 AVAILABLE = sys.platform == "linux"
 
 
-def run_script(name: str, arguments: list[str], cwd: Path | None, timeout_s: float) -> tuple[int, str, str]:
+def run_script(
+    name: str, arguments: list[str], cwd: Path | None, environment: dict[str, str], timeout_s: float
+) -> tuple[int, str, str]:
     """A console script's exit code, output and errors; TimeoutExpired if it takes longer."""
     prepared = multiprocessing.get_context("forkserver")
     prepared.set_forkserver_preload(["nerfstudio.scripts.train", "ebarf_ns.cli.main"])
     # rich reads the terminal's width when it is imported.
-    with patch.dict(os.environ, COLUMNS="200"):
+    with patch.dict(os.environ, environment):
         forkserver.ensure_running()
-    environment = {**os.environ, "COLUMNS": "200"}
     with tempfile.TemporaryDirectory() as folder:
         output, errors = Path(folder, "output"), Path(folder, "errors")
         process = prepared.Process(
